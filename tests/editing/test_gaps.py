@@ -13,10 +13,11 @@ from r3dpa.editing.gaps import (
     check_view,
     in_view,
     interpolate_gaps,
+    median_draw,
     range_error_m,
     unseen_pixels,
 )
-from r3dpa.geometry import LidarSensor, SphericalProjection, range_image
+from r3dpa.geometry import LidarSensor, Pixels, SphericalProjection, range_image
 
 PROJECTION = SphericalProjection(LidarSensor(beams=16, columns=64))
 
@@ -97,6 +98,14 @@ class TestBlend:
     def test_where_interpolation_has_nothing_it_is_as_generated(self):
         range_m, missing = torch.full((16, 64), -1.0), rows_missing(2)
         assert (self.blend(12.0, range_m, missing)[1] == 12).all()
+
+
+def test_themedian_draw_has_a_return_where_half_of_them_have():
+    range_m = torch.tensor([[[1.0, 2.0, -1.0]], [[5.0, -1.0, -1.0]], [[3.0, 4.0, 9.0]]])
+    classes = torch.arange(9).view(3, 1, 3)
+    median = median_draw(Pixels(range_m, None, classes))
+    assert median.range_m.tolist() == [[3.0, 2.0, -1.0]]
+    assert median.classes[0, :2].tolist() == [6, 1]
 
 
 def test_unseen_are_empty_rows_and_narrow_gaps_between_returns():

@@ -11,13 +11,12 @@ from tiny_networks import VAE_ARGS, tiny_checkpoint, tiny_networks
 
 from lidarsim import RecordedScan
 from r3dpa.data import write_bin
-from r3dpa.editing import EditSettings, SceneEditor, _median_draw
+from r3dpa.editing import EditSettings, SceneEditor
 from r3dpa.editing.regions import angle_box, dropped_beams, sector_weights, token_mask
 from r3dpa.generation import SamplerConfig, SceneGenerator
 from r3dpa.geometry import (
     NUM_CLASSES,
     LidarSensor,
-    Pixels,
     RangeCodec,
     ScanGeometry,
     SphericalProjection,
@@ -194,13 +193,6 @@ class TestComplete:
         assert not result.latents[0].equal(result.latents[1])
         with pytest.raises(ValueError, match=r"start must be a time above 0"):
             editor.complete(scan, missing, start=0.0)
-
-    def test_the_median_draw_has_a_return_where_half_of_them_have(self):
-        range_m = torch.tensor([[[1.0, 2.0, -1.0]], [[5.0, -1.0, -1.0]], [[3.0, 4.0, 9.0]]])
-        classes = torch.arange(9).view(3, 1, 3)
-        median = _median_draw(Pixels(range_m, None, classes))
-        assert median.range_m.tolist() == [[3.0, 2.0, -1.0]]
-        assert median.classes[0, :2].tolist() == [6, 1]
 
 
 class TestScans:

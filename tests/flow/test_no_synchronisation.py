@@ -9,8 +9,8 @@ import torch
 from one_device import OneDevice
 from tiny_networks import tiny_networks
 
-from r3dpa.editing.latents import invert, noise_inside_mask, restore_outside_mask
-from r3dpa.flow import FeatureGuidance, FeatureTarget, heun, ode_times, slerp
+from r3dpa.editing.latents import invert, noise_inside_mask, restore_outside_mask, slerp
+from r3dpa.flow import FeatureGuidance, FeatureTarget, heun, ode_times
 from r3dpa.flow.sampler import Solver
 from r3dpa.generation import Autoguidance, SamplerConfig, SceneGenerator
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection

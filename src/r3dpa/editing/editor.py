@@ -19,7 +19,12 @@ import torch
 from torch import Tensor
 
 from r3dpa.checkpoints import Checkpoint
-from r3dpa.editing.gaps import blend_completion, interpolate_gaps, range_error_m
+from r3dpa.editing.gaps import (
+    blend_completion,
+    interpolate_gaps,
+    median_draw,
+    range_error_m,
+)
 from r3dpa.editing.latents import Trajectory, invert, noise_inside_mask, restore_outside_mask, slerp
 from r3dpa.editing.regions import check_mask, mask_of_tokens, token_mask
 from r3dpa.flow.guidance import FeatureGuidance, FeatureTarget
@@ -27,7 +32,7 @@ from r3dpa.flow.noise import scene_noise
 from r3dpa.flow.solvers import ODE_SOLVERS, AfterStep, Velocity, evaluations, ode_solver, unchanged
 from r3dpa.flow.times import batch_time, check_interval, ode_times
 from r3dpa.generation import SamplerConfig, SceneGenerator, scene_indices
-from r3dpa.geometry import EMPTY_RANGE_M, UNKNOWN_CLASS, Pixels, labels_of
+from r3dpa.geometry import UNKNOWN_CLASS, Pixels, labels_of
 from r3dpa.scenes import ScanLike, SceneBatch, map_pixels, scan_pixels
 
 _COMPLETION_DRAWS = 3  # their median has a smaller error than one draw
@@ -286,7 +291,7 @@ class SceneEditor:
             time = batch_time(start, noise)
             noisy = path.interpolate(latents.expand_as(noise), noise, time)
             denoised = path.denoise(self._sit.velocity(noisy, time), noisy, time)
-            generated = _median_draw(self._decoded(denoised))
+            generated = median_draw(self._decoded(denoised))
             range_m = blend_completion(generated.range_m, pixels.range_m, missing)
             blended = _batch_of(generated._replace(range_m=range_m))
             completed.append(_paste(blended, pixels, missing))
@@ -453,22 +458,6 @@ def _concatenate(parts: Sequence[Pixels]) -> Pixels:
         torch.cat(intensities) if len(intensities) == len(parts) else None,
         torch.cat(classes) if len(classes) == len(parts) else None,
     )
-
-
-def _median_draw(draws: Pixels) -> Pixels:
-    """Pixels ``(H, W)`` with a return in at least half of the draws ``(K, H, W)``.
-
-    They have the range, intensity and class of the draw with the median range.
-    """
-    returns = draws.range_m > 0
-    median = torch.where(returns, draws.range_m, torch.nan).nanmedian(dim=0)
-    is_return = 2 * returns.sum(dim=0) >= len(returns)
-    range_m = torch.where(is_return, median.values, EMPTY_RANGE_M)
-    intensity, classes = (
-        None if values is None else values.gather(0, median.indices[None])[0]
-        for values in (draws.intensity, draws.classes)
-    )
-    return Pixels(range_m, intensity, classes)
 
 
 def _interpolated(pixels: Pixels, missing: Tensor) -> Pixels:

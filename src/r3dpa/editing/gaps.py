@@ -10,8 +10,8 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from r3dpa.geometry.projection import Projection, in_range
-from r3dpa.geometry.sensor import EMPTY_RANGE_M, angles_of
+from r3dpa.geometry import EMPTY_RANGE_M, Pixels, Projection, in_range
+from r3dpa.geometry.sensor import angles_of
 
 Interpolation = Literal["inverse", "linear", "nearest"]
 # Shares of the field of view that a scan of the same sensor fills.
@@ -128,6 +128,22 @@ def blend_completion(generated_m: Tensor, range_m: Tensor, missing: Tensor) -> T
     filled = torch.where(interpolated > 0, filled, generated_m)
     filled = torch.where(generated_m > 0, filled, EMPTY_RANGE_M)
     return torch.where(missing, filled, range_m)
+
+
+def median_draw(draws: Pixels) -> Pixels:
+    """Pixels ``(H, W)`` with a return in at least half of the draws ``(K, H, W)``.
+
+    They have the range, intensity and class of the draw with the median range.
+    """
+    returns = draws.range_m > 0
+    median = torch.where(returns, draws.range_m, torch.nan).nanmedian(dim=0)
+    is_return = 2 * returns.sum(dim=0) >= len(returns)
+    range_m = torch.where(is_return, median.values, EMPTY_RANGE_M)
+    intensity, classes = (
+        None if values is None else values.gather(0, median.indices[None])[0]
+        for values in (draws.intensity, draws.classes)
+    )
+    return Pixels(range_m, intensity, classes)
 
 
 def unseen_pixels(range_m: Tensor) -> Tensor:
