@@ -138,6 +138,24 @@ def summarise(table):
     return dict(summary)
 
 
+def print_table(name, summary):
+    """Mean errors, relative to linear interpolation on the same scans, and equal returns."""
+    gap_names = list(summary)
+    rows = []
+    for method in summary[gap_names[0]]:
+        if method == "cpu_seconds_per_scene":
+            continue
+        row = [method]
+        for gap in gap_names:
+            values = summary[gap][method]
+            linear_m = values["mae_m"] - values["minus_linear_m"]
+            relative = values["mae_m"] / linear_m
+            row.append(f"{values['mae_m']:.3f} {relative:.3f} {values['same_returns']:.3f}")
+        rows.append(row)
+    columns = [f"{name}: error, relative, returns", *gap_names]
+    print(text_table(rows, columns, "l" + "r" * len(gap_names), "plain"))  # noqa: T201
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("simulated", type=Path)
@@ -158,16 +176,7 @@ def main():
         order = np.random.default_rng(0).permutation(len(scans))
         shuffled = [scans[place] for place in order]
         results[name] = summarise(measure(editor, shuffled, num_candidates))
-        for value in ("mae_m", "same_returns"):
-            methods = [
-                m for m in next(iter(results[name].values())) if m != "cpu_seconds_per_scene"
-            ]
-            rows = [
-                [m, *(f"{results[name][gap][m][value]:.3f}" for gap in results[name])]
-                for m in methods
-            ]
-            columns = [f"{name}, {value}", *results[name]]
-            print(text_table(rows, columns, "l" + "r" * len(results[name]), "plain"))  # noqa: T201
+        print_table(name, results[name])
     given.out.write_text(json.dumps(results, indent=1) + "\n")
 
 

@@ -149,7 +149,7 @@ class EditSession:
             seen = points.masked_fill(outside[:, None], torch.nan)  # in no pixel
         pixels = project_pixels(seen, self.projection, labels)
         assert pixels.intensity is not None
-        return ScanView(path, points, *pixels)
+        return ScanView(path, points, pixels.range_m, pixels.intensity, pixels.classes)
 
     def check(self, scan: ScanView, missing: Tensor | None = None) -> None:
         """Refuse a scan that does not fill the field of view outside ``missing`` ``(H, W)``."""
