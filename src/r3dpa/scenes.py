@@ -221,14 +221,17 @@ class SceneBatch:
         """
         from r3dpa.data.scene_writer import SceneWriter
 
+        folder = Path(folder)
+        if (folder / "metadata.json").exists() and not overwrite:
+            raise ValueError(
+                f"{folder} holds scenes already; give another folder or overwrite=True"
+            )
         about = {"num": len(self), "nfe": self.nfe, "formats": list(formats)}
-        with SceneWriter(
-            Path(folder), len(self), self.projection, formats, about, overwrite
-        ) as writer:
+        with SceneWriter(folder, len(self), self.projection, formats, about, overwrite) as writer:
             writer.put(self.range_m, self.nfe, self.intensity, self.labels)
             writer.close()
             writer.finish(about)
-        return Path(folder)
+        return folder
 
     def show(self) -> Any:
         """Return a page with the first point clouds to turn, for the output of a notebook cell.

@@ -159,8 +159,9 @@ def complete_files(
     _, first_view, first_missing = job.read(paths[0])  # a bad request fails before the first file
     names = [path.relative_to(root).as_posix() for path in paths]
     request = session.request("complete", arguments, {"scans": names})
+    request |= {"num": len(paths) * num, "num_per_scan": num}
     with SceneWriter(
-        options.out, len(paths) * num, session.projection, (), request, options.overwrite
+        options.out, request["num"], session.projection, (), request, options.overwrite
     ) as writer:
         tasks = list(enumerate(paths))[writer.num_done // num :]
         for completion in _in_order(job, tasks, workers, len(paths)):
