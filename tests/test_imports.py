@@ -14,7 +14,7 @@ SOURCE = Path(__file__).resolve().parents[1] / "src"
 PACKAGES = ("lidarsim", "r3dpa")
 CORE = {"geometry", "flow", "losses", "nn"}
 METHOD = CORE | {"features", "data", "checkpoints", "generation", "editing", "lidarsim"}
-METHOD |= {"scene_vae", "pretrained", "modules"}
+METHOD |= {"scenes", "scene_vae", "pretrained", "modules"}
 ALLOWED = {
     "lidarsim": set(),
     "class_paths": set(),
@@ -27,10 +27,21 @@ ALLOWED = {
     "features": {"geometry", "nn"},
     "data": {"geometry", "features", "lidarsim"},
     "checkpoints": {"geometry", "nn", "pretrained", "class_paths"},
-    "generation": {"geometry", "nn", "flow", "checkpoints"},
-    "scene_vae": {"geometry", "nn", "generation", "checkpoints"},
+    # A batch of scenes writes its files and shows its pages.
+    "scenes": {"geometry", "data", "lidarsim", "viz"},
+    "generation": {"geometry", "nn", "flow", "checkpoints", "scenes"},
+    "scene_vae": {"geometry", "nn", "generation", "checkpoints", "scenes"},
     # Objects are cut out of labelled scans.
-    "editing": {"geometry", "nn", "flow", "checkpoints", "generation", "data", "lidarsim"},
+    "editing": {
+        "geometry",
+        "nn",
+        "flow",
+        "checkpoints",
+        "generation",
+        "scenes",
+        "data",
+        "lidarsim",
+    },
     "modules": METHOD,
     "metrics": {"geometry", "nn", "features", "lidarsim"},  # divergences that realism has, too
     "viz": METHOD | {"metrics"},

@@ -19,69 +19,12 @@ from r3dpa.flow.interpolant import Interpolant
 from r3dpa.flow.noise import scene_noise, scene_uniform
 from r3dpa.flow.sampler import Quality, SamplerConfig
 from r3dpa.flow.solvers import Velocity
-from r3dpa.geometry import (
-    Pixels,
-    Projection,
-    ScanGeometry,
-    labels_of,
-    points_of,
-    values_at_returns,
-)
+from r3dpa.geometry import Pixels, ScanGeometry
 from r3dpa.io import usable_device
 from r3dpa.nn import VAE, LatentNorm, SiT, VelocityNetwork
+from r3dpa.scenes import SceneBatch
 
 _GRAPH_BATCH = 8  # up to this many scenes, starting kernels takes as long as running them
-
-
-@dataclass(frozen=True, eq=False)
-class SceneBatch:
-    """Generated scenes, on the device of the networks.
-
-    Attributes:
-        range_m: ``(B, H, W)`` float32 metres; -1 without a return, NaN for a whole scene if the
-            networks returned anything non-finite for it.
-        latents: ``(B, C, h, w)`` normalised latents.
-        nfe: Network evaluations per scene.
-        projection: Maps pixels to points.
-        intensity: ``(B, H, W)`` in [0, 1], of networks that generate it.
-        labels: ``(B, H, W)`` int64 class ids of KITTI-360, 0 without a return, likewise.
-    """
-
-    range_m: Tensor
-    latents: Tensor
-    nfe: int
-    projection: Projection
-    intensity: Tensor | None = None
-    labels: Tensor | None = None
-
-    @classmethod
-    def of(cls, pixels: Pixels, latents: Tensor, nfe: int, projection: Projection) -> Self:
-        """Scenes of decoded pixels ``(B, H, W)``."""
-        labels = None if pixels.classes is None else labels_of(pixels.classes)
-        return cls(pixels.range_m, latents, nfe, projection, pixels.intensity, labels)
-
-    def __len__(self) -> int:
-        """Number of scenes B."""
-        return len(self.range_m)
-
-    def points(self, index: int) -> Tensor:
-        """Points ``(P, 3)`` of one scene in metres, x forward, y left, z up, on the CPU."""
-        return points_of(self.range_m[index].cpu(), self.projection)
-
-    def point_intensity(self, index: int) -> Tensor:
-        """Intensity ``(P,)`` of each of the points of one scene, on the CPU."""
-        return self._of_points("intensity", self.intensity, index)
-
-    def point_labels(self, index: int) -> Tensor:
-        """Class id of KITTI-360 ``(P,)`` of each of the points of one scene, on the CPU."""
-        return self._of_points("labels", self.labels, index)
-
-    def _of_points(self, name: str, values: Tensor | None, index: int) -> Tensor:
-        if values is None:
-            raise ValueError(
-                f"these scenes have no {name}: their checkpoint was trained on range images without"
-            )
-        return values_at_returns(values[index].cpu(), self.range_m[index].cpu(), self.projection)
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NamedTuple
 
+import yaml
+
 from r3dpa.io import first_line, text_table
 
 DEFAULT_WEIGHTS = "r3dpa-s"
@@ -51,6 +53,30 @@ def weights_file(source: str | Path) -> Path:
         missing = f"the weights {text} are not in this package ({_FOLDER})"
     raise FileNotFoundError(
         f"{missing}; give an existing file, hf://owner/name, or a name of `r3dpa models` ({names})"
+    )
+
+
+def check_features(source: str | Path) -> None:
+    """Refuse weights that 3D features cannot guide, by the file beside them; reads no weights.
+
+    Raises:
+        FileNotFoundError: If there are no such weights.
+        ValueError: If they were trained without 3D features.
+    """
+    path = weights_file(source)
+    description = path.with_suffix(".yaml")
+    if not description.is_file():
+        return
+    about = yaml.safe_load(description.read_text(encoding="utf-8"))
+    if "feature_source" in about and about["feature_source"] is None:
+        raise without_features(path)
+
+
+def without_features(path: Path) -> ValueError:
+    """Error of a checkpoint that 3D features cannot guide."""
+    return ValueError(
+        f"{path} was trained without 3D features, so that none can guide it; give a checkpoint of "
+        "a run with an extractor"
     )
 
 

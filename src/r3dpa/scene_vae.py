@@ -10,10 +10,11 @@ import torch
 from torch import Tensor
 
 from r3dpa.checkpoints import Checkpoint
-from r3dpa.generation import SceneBatch, geometry_of, opened
+from r3dpa.generation import geometry_of, opened
 from r3dpa.geometry import ScanGeometry, project_pixels
 from r3dpa.io import usable_device
 from r3dpa.nn import VAE
+from r3dpa.scenes import SceneBatch
 
 
 class SceneVAE:

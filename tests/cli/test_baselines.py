@@ -277,3 +277,8 @@ def test_latents_are_completed(trained):
     none = torch.zeros_like(known)
     free, same = (generator.complete(x, none, seed=1).latents for x in (image, other))
     torch.testing.assert_close(free, same)
+    # A latent is known where all of its pixels are: with a corner of each missing, none is.
+    corners, (height, width) = torch.ones_like(known), found.latents.shape[-2:]
+    corners[:: 16 // height, :: 64 // width] = False
+    partly = generator.complete(image, corners, seed=1).latents
+    torch.testing.assert_close(partly, free)

@@ -9,8 +9,9 @@ from PIL import Image
 from tiny_networks import tiny_checkpoint
 
 from lidarsim import simulate
+from lidarsim.scan_files import read_ply
 from r3dpa import viz
-from r3dpa.cli import main
+from r3dpa.cli import edit_session, main
 from r3dpa.data import read_scan, write_bin, write_npz, write_ply
 from r3dpa.editing import SceneEditor
 from r3dpa.geometry import (
@@ -118,32 +119,6 @@ class TestFiles:
         mask = np.asarray(Image.open(tmp_path / "sides" / "mask.png"))
         assert set(np.unique(mask)) == {0, 255}
 
-    def test_complete_takes_any_file_and_measures_what_was_left_out(
-        self, files, no_sheet, tmp_path
-    ):
-        more = ["--scan", files / "one.npz", "--keep_every", 2, "--sector", 170, -170]
-        about = edit(files, "complete", tmp_path / "out", *more, num=1)
-        made = torch.from_numpy(np.load(tmp_path / "out" / "range_m.npy"))[0]
-        missing = torch.from_numpy(np.asarray(Image.open(tmp_path / "out" / "mask.png")) > 0)
-        assert missing[1::2].all()
-        assert missing[:, [0, 63]].all()
-        assert made[~missing].equal(images(files)[~missing])
-        assert set(about["held_out"]) == {"completed", "nearest", "linear"}
-        assert about["held_out"]["linear"]["mae_m"] < about["held_out"]["nearest"]["mae_m"]
-        # Of the beams that were left out here no point is in the file.
-        sparse = images(files)
-        sparse[1::2] = -1
-        write_ply(tmp_path / "sparse.ply", points_of(sparse, PROJECTION))
-        more = ["--scan", tmp_path / "sparse.ply", "--empty_beams"]
-        edit(files, "complete", tmp_path / "o", *more)
-        assert (np.asarray(Image.open(tmp_path / "o" / "mask.png"))[1::2] == 255).all()
-        # Another sensor has the same columns, and half of the beams.
-        more = ["--scan", files / "a.bin", "--other_sensor", "[8, -25, 3]", "--overwrite"]
-        about = edit(files, "complete", tmp_path / "o", *more, num=1)
-        missing = np.asarray(Image.open(tmp_path / "o" / "mask.png")) > 0
-        assert missing.all(axis=1).sum() == missing.any(axis=1).sum() == 8
-        assert about["other_sensor"] == [8, -25.0, 3.0]
-
     def test_vary_and_interpolate(self, files, no_sheet, tmp_path):
         about = edit(files, "vary", tmp_path / "v", "--scan", files / "a.bin", "--start", 0.3)
         assert about["nfe"] == 4
@@ -152,6 +127,97 @@ class TestFiles:
         about = edit(files, "interpolate", tmp_path / "i", *ends)
         assert np.load(tmp_path / "i" / "range_m.npy").shape == (3, 16, 64)
         assert not (tmp_path / "i" / "mask.png").exists()
+
+
+def missing_of(out):
+    return torch.from_numpy(np.asarray(Image.open(out / "mask.png")) > 0)
+
+
+@pytest.mark.usefixtures("no_sheet")
+class TestComplete:
+    def test_errors_are_measured_where_returns_were_left_out(self, files, tmp_path, capsys):
+        out, more = tmp_path / "out", ["--keep_every", 2, "--sector", 170, -170]
+        about = edit(files, "complete", out, "--scan", files / "one.npz", *more, num=1)
+        image, missing = torch.from_numpy(np.load(out / "range_m.npy"))[0], missing_of(out)
+        assert missing[1::2].all()
+        assert missing[:, [0, 63]].all()
+        assert image[~missing].equal(images(files)[~missing])
+        assert set(about["held_out"]) == {"completed", "nearest", "linear"}
+        linear, nearest = (about["held_out"][how]["mae_m"] for how in ("linear", "nearest"))
+        assert linear < nearest
+        text = capsys.readouterr().out
+        assert (
+            f"linear interpolation {linear:.2f} m, nearest beam or column {nearest:.2f} m" in text
+        )
+
+    def test_empty_beams_are_filled_and_nothing_else_is_lost(self, files, tmp_path, capsys):
+        """Of every second beam no point is in the file; the others come back bit for bit."""
+        sparse = images(files)
+        sparse[1::2] = -1
+        write_ply(tmp_path / "sparse.ply", points_of(sparse, PROJECTION))
+        out = tmp_path / "out"
+        edit(files, "complete", out, "--scan", tmp_path / "sparse.ply", "--empty_beams", num=1)
+        assert missing_of(out)[1::2].all()
+        given, completed = read_ply(tmp_path / "sparse.ply"), read_ply(out / "scans/sparse.ply")
+        assert completed[: len(given)].tobytes() == given.tobytes()
+        assert len(completed) > 1.5 * len(given)
+        image = torch.from_numpy(np.load(out / "range_m.npy"))[0]
+        added = torch.where(sparse > 0, -1.0, image)
+        assert np.array_equal(completed[len(given) :], points_of(added, PROJECTION).numpy())
+        assert "no return was held out; on 30 real scans" in capsys.readouterr().out
+
+    def test_points_come_back_with_every_column_and_beyond_the_range(self, files, tmp_path):
+        """Columns of nuScenes, intensities to 255, a point at 90 m, one above the view, labels."""
+        points = read_scan(files / "a.bin")
+        sparse = points[PROJECTION.pixel_of(torch.from_numpy(points[:, :3]))[0] % 2 == 0]
+        rows = np.column_stack([sparse, np.arange(len(sparse)) % 32]).astype(np.float32)
+        rows[:, 3] = np.round(255 * rows[:, 3])
+        rows[7, :3], rows[8, :3] = (90, 0, 0), (5, 0, 5)
+        (tmp_path / "scan.pcd.bin").write_bytes(rows.tobytes())
+        labels = np.arange(len(rows), dtype="<u4")
+        (tmp_path / "scan.label").write_bytes(labels.tobytes())
+        words = ["--scan", tmp_path / "scan.pcd.bin", "--empty_beams"]
+        edit(files, "complete", tmp_path / "out", *words, num=2)
+        for number in range(2):
+            path = tmp_path / "out" / "scans" / str(number) / "scan.pcd.bin"
+            completed = np.fromfile(path, "<f4").reshape(-1, 5)
+            assert completed[: len(rows)].tobytes() == rows.tobytes()
+            assert len(completed) > len(rows)
+            added = completed[len(rows) :, 3]
+            assert added.max() > 1  # in the units of the file
+            written = np.fromfile(path.with_name("scan.label"), "<u4")
+            assert np.array_equal(written[: len(rows)], labels)
+            assert not written[len(rows) :].any()
+
+    def test_a_folder_is_completed_alike_by_any_number_of_workers(self, files, tmp_path):
+        for drive, name in (("x", "a"), ("y", "b"), ("y", "a")):
+            write_bin(tmp_path / "in" / drive / f"{name}.bin", read_scan(files / f"{name}.bin"))
+        written = []
+        for workers in (1, 2):
+            out = tmp_path / str(workers)
+            words = ["--scan", tmp_path / "in", "--keep_every", 4, "--workers", workers]
+            about = edit(files, "complete", out, *words, num=1)
+            assert about["scans"] == ["x/a.bin", "y/a.bin", "y/b.bin"]
+            assert set(about["held_out_by_scan"]) == set(about["scans"])
+            written.append([(out / "scans" / name).read_bytes() for name in about["scans"]])
+            written[-1].append(np.load(out / "range_m.npy").tobytes())
+        assert written[0] == written[1]
+        assert written[0][0] == written[0][1] != written[0][2]
+
+    def test_another_sensor_has_the_same_columns_and_half_of_the_beams(self, files, tmp_path):
+        more = ["--scan", files / "a.bin", "--other_sensor", "[8, -25, 3]"]
+        about = edit(files, "complete", tmp_path / "o", *more, num=1)
+        missing = missing_of(tmp_path / "o")
+        assert missing.all(dim=1).sum() == missing.any(dim=1).sum() == 8
+        assert about["other_sensor"] == [8, -25.0, 3.0]
+
+    def test_a_scan_of_fewer_beams_is_told_of_the_option(self, files, tmp_path):
+        sparse = images(files)
+        sparse[1::2] = -1
+        write_ply(tmp_path / "sparse.ply", points_of(sparse, PROJECTION))
+        words = ["--scan", tmp_path / "sparse.ply", "--sector", 0, 30]
+        with pytest.raises(ValueError, match="which `r3dpa edit complete --empty_beams` fills"):
+            edit(files, "complete", tmp_path / "o", *words)
 
 
 REFUSED = [
@@ -188,6 +254,22 @@ def test_bad_input_is_refused_before_networks_run(
     with pytest.raises(ValueError, match=message):
         edit(files, command, tmp_path / "out", *scan, *more.split())
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "mix --left a.bin --right b.bin --out o",
+        "inpaint --scan a.bin --objects lib.safetensors --object car --mask m.png --out o",
+        "objects --data data --out o.safetensors",
+    ],
+)
+def test_a_model_without_features_is_refused_before_anything_is_loaded(files, monkeypatch, words):
+    monkeypatch.chdir(files)
+    monkeypatch.setattr("r3dpa.checkpoints.files.load_file", lambda *_: pytest.fail("loaded"))
+    monkeypatch.setattr(edit_session, "read_checkpoint", lambda *_: pytest.fail("loaded"))
+    with pytest.raises(ValueError, match=r"None.safetensors was trained without 3D features"):
+        main([*words.split(), "--ckpt", "None.safetensors"])
 
 
 def test_an_interrupt_ends_in_one_line_and_leaves_nothing(files, tmp_path, monkeypatch, capsys):

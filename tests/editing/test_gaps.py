@@ -8,8 +8,16 @@ import pytest
 import torch
 
 from r3dpa.data import read_scan
-from r3dpa.editing.gaps import check_view, filled, range_error_m, refined
-from r3dpa.geometry import LidarSensor, SphericalProjection, range_image
+from r3dpa.editing.gaps import (
+    blend_completion,
+    check_view,
+    in_view,
+    interpolate_gaps,
+    median_draw,
+    range_error_m,
+    unseen_pixels,
+)
+from r3dpa.geometry import LidarSensor, Pixels, SphericalProjection, range_image
 
 PROJECTION = SphericalProjection(LidarSensor(beams=16, columns=64))
 
@@ -27,19 +35,19 @@ def a_plane():
     return range_m.float()[:, None].repeat(1, 64)
 
 
-class TestFilled:
+class TestInterpolation:
     def test_known_pixels_and_scans_without_gaps_stay(self):
         range_m, missing = a_plane(), rows_missing(4)
         for how in ("inverse", "linear", "nearest"):
-            assert filled(range_m, missing, how)[~missing].equal(range_m[~missing])
-            assert filled(range_m, torch.zeros_like(missing), how).equal(range_m)
+            assert interpolate_gaps(range_m, missing, how)[~missing].equal(range_m[~missing])
+            assert interpolate_gaps(range_m, torch.zeros_like(missing), how).equal(range_m)
 
     def test_inverse_range_is_exact_on_the_ground_but_for_the_curvature_of_angles(self):
         """Between beams 3.5 degrees apart 1 / range follows a sine, straight to 1e-3."""
         range_m, missing = a_plane(), rows_missing(2)
         errors = {}
         for how in ("inverse", "linear", "nearest"):
-            made = filled(range_m, missing, how)
+            made = interpolate_gaps(range_m, missing, how)
             errors[how] = ((made - range_m).abs() / range_m)[4:15].max().item()
         assert errors["inverse"] < 1e-3 < errors["linear"] < errors["nearest"]
 
@@ -47,10 +55,15 @@ class TestFilled:
         range_m = torch.full((16, 64), -1.0)
         range_m[0], range_m[4], range_m[8] = 10.0, 40.0, -1.0
         missing = rows_missing(4)
-        linear, nearest = filled(range_m, missing, "linear"), filled(range_m, missing, "nearest")
+        linear, nearest = (
+            interpolate_gaps(range_m, missing, "linear"),
+            interpolate_gaps(range_m, missing, "nearest"),
+        )
         assert linear[:5, 0].tolist() == [10.0, 17.5, 25.0, 32.5, 40.0]
         assert nearest[:5, 0].tolist() == [10.0, 10.0, 10.0, 40.0, 40.0]
-        assert filled(range_m, missing)[2, 0].item() == pytest.approx(16.0)  # 1 / mean(.1, .025)
+        assert interpolate_gaps(range_m, missing)[2, 0].item() == pytest.approx(
+            16.0
+        )  # 1 / mean(.1, .025)
         # Beside a beam without a return nothing is averaged with its -1.
         assert linear[4:9, 0].tolist() == [40.0, 40.0, 40.0, -1.0, -1.0]
 
@@ -59,32 +72,55 @@ class TestFilled:
         range_m[:, 32:] = 20.0
         missing = torch.zeros(16, 64, dtype=torch.bool)
         missing[:, [0, 1, 62, 63]] = True
-        made = filled(range_m, missing, "linear")
+        made = interpolate_gaps(range_m, missing, "linear")
         assert made[0, [62, 63, 0, 1]].tolist() == [18.0, 16.0, 14.0, 12.0]
 
 
-class TestRefined:
-    def test_one_surface_is_interpolated_and_empty_beams_leave_nothing_between(self):
-        range_m = torch.full((16, 64), -1.0)
-        range_m[0:3] = 10.0
-        missing = rows_missing(2)
-        made = refined(torch.full((16, 64), 11.0), range_m, missing)
-        assert (made[1] == 10).all()
-        assert (made[5] == -1).all()
+class TestBlend:
+    def blend(self, generated_m, range_m, missing):
+        return blend_completion(torch.full((16, 64), generated_m), range_m, missing)
 
-    def test_at_an_edge_the_error_of_known_beams_is_taken_off(self):
-        range_m = torch.full((16, 64), 10.0)
+    def test_one_surface_is_interpolated_and_the_generated_image_says_where_returns_are(self):
+        range_m, missing = torch.full((16, 64), 10.0), rows_missing(2)
+        assert (self.blend(11.0, range_m, missing) == 10).all()
+        without = self.blend(-1.0, range_m, missing)
+        assert (without[missing] == -1).all()
+        assert (without[~missing] == 10).all()
+
+    def test_at_an_edge_it_is_the_mean_of_both_within_the_neighbours(self):
+        """Between 10 and 30 m: 15 m halfway in 1 / range; 12 m lie between them, 50 m do not."""
+        range_m, missing = torch.full((16, 64), 10.0), rows_missing(2)
         range_m[2:] = 30.0
-        missing = rows_missing(2)
-        made = torch.full((16, 64), 12.0)  # 2 m too long above the edge, 18 m too short below
-        assert (refined(made, range_m, missing)[1] == 12 + (-2 + 18) / 2).all()
+        for generated_m, expected in ((12.0, 13.5), (50.0, 22.5), (2.0, 12.5)):
+            edge = self.blend(generated_m, range_m, missing)[1]
+            torch.testing.assert_close(edge, torch.full((64,), expected))
 
-    def test_far_from_what_is_known_it_stays_as_made(self):
-        range_m = torch.full((16, 64), 10.0)
-        missing = torch.ones(16, 64, dtype=torch.bool)
-        missing[0] = False
-        made = refined(torch.full((16, 64), 12.0), range_m, missing)
-        assert (made[8:] == 12).all()
+    def test_where_interpolation_has_nothing_it_is_as_generated(self):
+        range_m, missing = torch.full((16, 64), -1.0), rows_missing(2)
+        assert (self.blend(12.0, range_m, missing)[1] == 12).all()
+
+
+def test_themedian_draw_has_a_return_where_half_of_them_have():
+    range_m = torch.tensor([[[1.0, 2.0, -1.0]], [[5.0, -1.0, -1.0]], [[3.0, 4.0, 9.0]]])
+    classes = torch.arange(9).view(3, 1, 3)
+    median = median_draw(Pixels(range_m, None, classes))
+    assert median.range_m.tolist() == [[3.0, 2.0, -1.0]]
+    assert median.classes[0, :2].tolist() == [6, 1]
+
+
+def test_unseen_are_empty_rows_and_narrow_gaps_between_returns():
+    """Beams in rows 0, 3 and 15: two rows between the first, eleven between the last two."""
+    range_m = torch.full((16, 64), -1.0)
+    range_m[[0, 3, 15]] = 10.0
+    range_m[6, 0] = range_m[3, 5] = -1
+    range_m[8, 1] = 10.0
+    unseen = unseen_pixels(range_m)
+    assert not unseen[range_m > 0].any()
+    assert unseen[[1, 2, 4, 5, 6]].all()  # rows without a return
+    assert unseen[8].nonzero()[:, 0].tolist() == []  # gaps of 11 rows in a row that is not empty
+    assert not unseen[3, 5]  # 15 rows from return to return
+    range_m[7, 2] = range_m[9, 2] = 10.0
+    assert unseen_pixels(range_m)[8].nonzero()[:, 0].tolist() == [2]
 
 
 def cloud(lowest_deg, highest_deg, beams=64, azimuths_deg=(-180.0, 180.0)):
@@ -116,7 +152,16 @@ class TestView:
         with pytest.raises(ValueError, match=message):
             self.check(points)
 
-    def test_what_is_missing_need_not_be_filled(self):
+    def test_a_scan_of_fewer_beams_passes_where_the_others_are_missing(self):
+        """A third of its points lies beyond the field of view of the checkpoint."""
+        points = torch.cat([cloud(10, 20, beams=4), cloud(-24, 2.0, beams=8)])
+        assert 0.2 < 1 - in_view(points, PROJECTION).float().mean() < 0.6
+        range_m = range_image(points[in_view(points, PROJECTION)], PROJECTION)[0]
+        check_view(points, range_m, PROJECTION, unseen_pixels(range_m))
+        with pytest.raises(ValueError, match="outside the field of view"):
+            check_view(points, range_m, PROJECTION)
+
+    def test_what_is_missing_need_not_be_interpolate_gaps(self):
         missing = torch.ones(16, 64, dtype=torch.bool)
         missing[:, 24:40] = False  # 90 degrees ahead
         self.check(cloud(-24.5, 2.5, azimuths_deg=(-50, 50)), missing)

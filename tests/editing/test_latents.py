@@ -4,7 +4,13 @@ import pytest
 import torch
 from velocities import still
 
-from r3dpa.editing.latents import invert, kept, pnp_flow_feature, renoised, spherical_mean
+from r3dpa.editing.latents import (
+    invert,
+    noise_inside_mask,
+    pnp_flow_feature,
+    restore_outside_mask,
+    slerp,
+)
 from r3dpa.flow.interpolant import Interpolant
 from r3dpa.flow.solvers import ODE_SOLVERS, ode_solver
 from r3dpa.flow.times import ode_times
@@ -66,7 +72,7 @@ class TestKept:
         """And at every time on the way they are those of the inversion, whatever the velocity."""
         way = invert(growth, latents(), ode_times(6, start=start), "euler")
         noise = latents().flip(0)
-        put_back, seen = kept(way, edit_mask()), []
+        put_back, seen = restore_outside_mask(way, edit_mask()), []
 
         def after_step(x, time, index):
             x = put_back(x, time, index)
@@ -76,7 +82,7 @@ class TestKept:
         def elsewhere(x, time):
             return 3 * torch.ones_like(x) - growth(x, time)
 
-        begin = renoised(way, edit_mask(), noise)
+        begin = noise_inside_mask(way, edit_mask(), noise)
         end = ode_solver(solver, after_step=after_step)(elsewhere, begin, way.times)
         mask = edit_mask().expand_as(end)
         assert torch.equal(end[~mask], latents()[~mask])
@@ -88,8 +94,10 @@ class TestKept:
     def test_without_other_influence_the_edited_part_is_a_plain_sample(self, solver):
         """The velocity of a pixel depends on that pixel alone."""
         way = invert(growth, latents(), ode_times(6), solver)
-        begin = renoised(way, edit_mask(), latents().flip(0))
-        edited = ode_solver(solver, after_step=kept(way, edit_mask()))(growth, begin, way.times)
+        begin = noise_inside_mask(way, edit_mask(), latents().flip(0))
+        edited = ode_solver(solver, after_step=restore_outside_mask(way, edit_mask()))(
+            growth, begin, way.times
+        )
         plain = ode_solver(solver)(growth, begin, way.times)
         expected = torch.where(edit_mask(), plain, latents())
         assert torch.equal(edited, expected)
@@ -97,7 +105,7 @@ class TestKept:
     def test_a_solver_on_another_grid_is_refused(self):
         way = invert(growth, latents(), ode_times(4), "euler")
         for times in (ode_times(5), ode_times(4, shift=2.0)):
-            solve = ode_solver("euler", after_step=kept(way, edit_mask()))
+            solve = ode_solver("euler", after_step=restore_outside_mask(way, edit_mask()))
             with pytest.raises(ValueError, match="step 1 of the solver ends at t = "):
                 solve(growth, latents(), times)
         longer = [*ode_times(4).tolist(), -0.25]
@@ -108,18 +116,18 @@ class TestKept:
         way = invert(growth, latents(), ode_times(2), "euler")
         for mask in (edit_mask().float(), edit_mask()[0], edit_mask()[..., :2]):
             with pytest.raises(ValueError, match=r"such as \(2, 1, 4, 6\); got torch"):
-                kept(way, mask)
+                restore_outside_mask(way, mask)
             with pytest.raises(ValueError, match=r"such as \(2, 1, 4, 6\); got torch"):
-                renoised(way, mask, latents())
+                noise_inside_mask(way, mask, latents())
         with pytest.raises(ValueError, match=r"shape \(2, 3, 4, 6\), got \(1, 3, 4, 6\)"):
-            renoised(way, edit_mask(), latents()[:1])
+            noise_inside_mask(way, edit_mask(), latents()[:1])
 
 
 def test_all_of_the_noise_at_time_1_and_a_part_before():
     noise = latents().flip(0)
     for start, path in ((1.0, "linear"), (0.25, "linear"), (0.25, "cosine")):
         way = invert(growth, latents(), ode_times(3, start=start), "euler")
-        state = renoised(way, edit_mask(), noise, Interpolant(path))
+        state = noise_inside_mask(way, edit_mask(), noise, Interpolant(path))
         quarter = torch.tensor(torch.pi / 8).double()
         data, fresh = (1 - start, start) if path == "linear" else (quarter.cos(), quarter.sin())
         inside = data * latents() + fresh * noise
@@ -129,22 +137,22 @@ def test_all_of_the_noise_at_time_1_and_a_part_before():
 class TestSphericalMean:
     def test_by_hand(self):
         east, north = torch.tensor([[2.0, 0.0]]), torch.tensor([[0.0, 2.0]])
-        third = spherical_mean(east, north, 1 / 3)
+        third = slerp(east, north, 1 / 3)
         torch.testing.assert_close(third, 2 * torch.tensor([[3**0.5 / 2, 0.5]]))
 
     def test_ends_and_equal_noises(self):
         first, second = latents(), latents().flip(0)
-        torch.testing.assert_close(spherical_mean(first, second, 0.0), first)
-        torch.testing.assert_close(spherical_mean(first, second, 1.0), second)
-        torch.testing.assert_close(spherical_mean(first, first, 0.3), first)
-        opposite = spherical_mean(first, -first, 0.5)
+        torch.testing.assert_close(slerp(first, second, 0.0), first)
+        torch.testing.assert_close(slerp(first, second, 1.0), second)
+        torch.testing.assert_close(slerp(first, first, 0.3), first)
+        opposite = slerp(first, -first, 0.5)
         assert opposite.abs().max() < 1e-12
 
     def test_impossible_means_are_refused(self):
         with pytest.raises(ValueError, match=r"share in \[0, 1\], got .* 1.5"):
-            spherical_mean(latents(), latents(), 1.5)
+            slerp(latents(), latents(), 1.5)
         with pytest.raises(ValueError, match="one shape"):
-            spherical_mean(latents(), latents()[:1], 0.5)
+            slerp(latents(), latents()[:1], 0.5)
 
 
 def test_steps_by_hand():

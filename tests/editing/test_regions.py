@@ -57,6 +57,12 @@ def test_azimuths_count_to_the_left_and_across_the_seam(azimuths, columns):
     assert selected(angle_box(RINGS, *azimuths, -30, -5), 0) == [3]
 
 
+def test_a_box_includes_its_lower_inclination_and_not_its_upper_one():
+    """Rays at 15, 5, -5 and -15 degrees, two of them on the borders."""
+    assert selected(angle_box(COARSE, 0, 20, -5, 5), 0) == [2]
+    assert selected(angle_box(COARSE, 0, 20, -15, 15), 0) == [1, 2, 3]
+
+
 def test_a_sector_and_the_rest_of_the_turn_share_no_pixel_and_leave_none():
     for border in (-175.0, -33.3, 5.0, 120.0):
         first, second = sector(COARSE, border, 45), sector(COARSE, 45, border)

@@ -2,15 +2,30 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 import torch
 from tiny_networks import VAE_ARGS, tiny_checkpoint, tiny_networks
 
+from lidarsim import RecordedScan
+from r3dpa.data import write_bin
 from r3dpa.editing import EditSettings, SceneEditor
 from r3dpa.editing.regions import angle_box, dropped_beams, sector_weights, token_mask
 from r3dpa.generation import SamplerConfig, SceneGenerator
-from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection, points_of
+from r3dpa.geometry import (
+    NUM_CLASSES,
+    LidarSensor,
+    RangeCodec,
+    ScanGeometry,
+    SphericalProjection,
+    points_of,
+    range_image,
+)
 from r3dpa.nn import VAE
+from r3dpa.scene_vae import SceneVAE
+from r3dpa.scenes import Scene
 
 SENSOR = LidarSensor(beams=16, columns=64, range_min_m=1.0, range_max_m=50.0)
 GEOMETRY = ScanGeometry(SphericalProjection(SENSOR), RangeCodec(), (2, 8))
@@ -98,10 +113,7 @@ class TestInpaint:
 
 
 def test_a_scene_does_not_depend_on_its_batch(generator, scan):
-    """Up to rounding of another batch size: 1e-4 in latents of size 1.
-
-    Completions are fitted step by step, which would enlarge it: they are made one by one.
-    """
+    """Up to rounding of another batch size: 1e-4 in latents of size 1."""
     missing = dropped_beams(GEOMETRY.projection, range(0, 16, 2))
     few = EditSettings(steps=2)
     together = SceneEditor(generator, few, batch_size=2)
@@ -113,7 +125,7 @@ def test_a_scene_does_not_depend_on_its_batch(generator, scan):
     ):
         several, single = edit(together, [0, 2]), edit(alone, [2])
         torch.testing.assert_close(several.latents[1:], single.latents, atol=rounding, rtol=0)
-        assert not several.latents[0].allclose(several.latents[1], atol=1e-1)
+        assert not several.latents[0].allclose(several.latents[1], atol=1e-2)
 
 
 def test_scenes_made_anew_lose_single_returns_by_number_and_seed(scan):
@@ -169,26 +181,99 @@ class TestComplete:
     def test_known_pixels_stay_and_what_the_scan_holds_elsewhere_is_not_used(self, generator, scan):
         editor = SceneEditor(generator, EditSettings(steps=2))
         missing = dropped_beams(GEOMETRY.projection, range(0, 16, 2))
-        result = editor.complete(scan, missing, [0])
+        result = editor.complete(scan, missing)
         assert result.range_m[0][~missing].equal(scan[~missing])
         other = torch.where(missing, 30.0, scan)
-        assert editor.complete(other, missing, [0]).range_m.equal(result.range_m)
+        assert editor.complete(other, missing).range_m.equal(result.range_m)
 
-    def test_latents_are_fitted_to_what_is_known(self, editor, scan):
-        codec = GEOMETRY.codec
-        known = (~dropped_beams(GEOMETRY.projection, range(0, 16, 2))).float()
-        image, latents = codec.encode(scan), editor.encode(scan[None])
+    def test_results_differ_little_and_cost_three_evaluations(self, editor, scan):
+        missing = dropped_beams(GEOMETRY.projection, range(0, 16, 2))
+        result = editor.complete(scan, missing, 2)
+        assert result.nfe == 3
+        assert not result.latents[0].equal(result.latents[1])
+        with pytest.raises(ValueError, match=r"start must be a time above 0"):
+            editor.complete(scan, missing, start=0.0)
 
-        def error(latents):
-            with torch.no_grad():
-                raw = editor.generator.latent_norm.denormalise(latents)
-                made = editor.generator.vae.decode(raw)[0, 0]
-            return ((made - image).abs() * known).sum()
 
-        fitted = latents
-        for _ in range(5):
-            fitted = editor._fitted(fitted, image, known)
-        assert error(fitted) < 0.9 * error(latents)
+class TestScans:
+    """Points, arrays, tensors, files, scans and scenes: all are one scan."""
+
+    def test_every_kind_of_scan_has_the_same_latents(self, editor, tmp_path):
+        random = torch.Generator().manual_seed(0)
+        points = torch.cat(
+            [8 * torch.randn(500, 3, generator=random), torch.rand(500, 1, generator=random)], 1
+        )
+        write_bin(tmp_path / "scan.bin", points)
+        range_m = range_image(points[:, :3], GEOMETRY.projection)[0]
+        recorded = RecordedScan(points[:, :3].numpy(), points[:, 3].numpy())
+        scene = Scene(range_m, GEOMETRY.projection)
+        given = [points, points.numpy(), points[:, :3], range_m, range_m.numpy(), range_m[None]]
+        given += [str(tmp_path / "scan.bin"), tmp_path / "scan.bin", recorded, scene]
+        first, *others = (editor.encode(scan) for scan in given)
+        assert all(latents.equal(first) for latents in others)
+        mask = MASK.numpy()
+        edited = editor.inpaint(points.numpy(), mask, 1)
+        assert edited.range_m.equal(editor.inpaint(range_m, MASK, 1).range_m)
+
+    @pytest.mark.parametrize(
+        ("scan", "message"),
+        [
+            (torch.zeros(5, 2), r"points \(P, 3\) or \(P, 4\), or a range image \(16, 64\)"),
+            (torch.full((5, 3), torch.nan), "NaN or infinite"),
+            (torch.full((5, 3), 4000.0), "no point within 1..50 m; coordinates must be metres"),
+            (torch.zeros(0, 3), "no point within"),
+        ],
+    )
+    def test_what_is_no_scan_is_refused(self, editor, scan, message):
+        with pytest.raises(ValueError, match=message):
+            editor.encode(scan)
+
+
+@pytest.fixture(scope="module")
+def labelled():
+    codec = RangeCodec(return_channel=True, intensity_channel=True, num_classes=NUM_CLASSES)
+    further = {"in_channels": 2, "intensity": True, "num_classes": NUM_CLASSES}
+    networks = tiny_networks(spread=0.05, vae_args=VAE_ARGS | further)
+    torch.nn.init.normal_(networks[0].encoder.further_in.weight)  # as a training makes it
+    geometry = ScanGeometry(GEOMETRY.projection, codec, GEOMETRY.grid_size)
+    return SceneEditor(SceneGenerator(*networks, geometry), EditSettings(steps=2))
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    random = np.random.default_rng(0)
+    points = (10 * random.normal(size=(2000, 3))).astype(np.float32)
+    return RecordedScan(points, random.random(2000), labels=np.full(2000, 26, np.uint32))
+
+
+class TestLabels:
+    """Checkpoints with intensity and labels."""
+
+    def test_intensity_and_labels_are_encoded(self, labelled, recorded):
+        latents = labelled.encode(recorded)
+        vae = SceneVAE(labelled.generator.vae, labelled.generator.geometry)
+        points = np.column_stack([recorded.points, recorded.intensity])
+        expected = labelled.generator.latent_norm.normalise(vae.encode(points, recorded.labels))
+        assert latents.equal(expected)
+        trucks = replace(recorded, labels=recorded.labels + 1)
+        assert not latents.equal(labelled.encode(trucks))
+        with pytest.raises(ValueError, match="needs scans with an intensity"):
+            labelled.encode(recorded.points)
+        with pytest.raises(ValueError, match=r"intensities up to 2\d\d.*divide them by their full"):
+            labelled.encode(replace(recorded, intensity=255 * recorded.intensity))
+
+    def test_results_have_those_of_the_scan_outside_the_mask(self, labelled, recorded):
+        scan = labelled.pixels(recorded)
+        for result in (labelled.inpaint(recorded, MASK, 1), labelled.complete(recorded, MASK)):
+            outside = ~MASK & (scan.range_m > 0)
+            assert result.intensity[0][outside].equal(scan.intensity[outside])
+            assert (result.labels[0][outside] == 26).all()
+            made = MASK & (result.range_m[0] > 0)
+            assert made.any()
+            assert len(result.labels[0][made].unique()) > 2
+            assert len(result.intensity[0][made].unique()) > 20
+            assert (result.labels > 0).equal(result.range_m > 0)
+        assert labelled.vary(recorded, 1).labels is not None
 
 
 class TestVaryAndInterpolate:
@@ -240,3 +325,7 @@ def test_a_checkpoint_is_edited_with_its_averaged_weights(tmp_path, scan):
     expected = SceneEditor(SceneGenerator(*networks, GEOMETRY), SETTINGS).vary(scan, range(2))
     assert torch.equal(found.latents, expected.latents)
     assert torch.equal(found.points(1), points_of(expected.range_m[1], GEOMETRY.projection))
+
+
+def test_an_editor_says_what_it_is(editor):
+    assert repr(editor) == "SceneEditor(16 x 64 pixels, midpoint, 6 steps, cpu)"

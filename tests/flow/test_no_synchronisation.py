@@ -9,7 +9,7 @@ import torch
 from one_device import OneDevice
 from tiny_networks import tiny_networks
 
-from r3dpa.editing.latents import invert, kept, renoised, spherical_mean
+from r3dpa.editing.latents import invert, noise_inside_mask, restore_outside_mask, slerp
 from r3dpa.flow import FeatureGuidance, FeatureTarget, heun, ode_times
 from r3dpa.flow.sampler import Solver
 from r3dpa.generation import Autoguidance, SamplerConfig, SceneGenerator
@@ -76,8 +76,8 @@ def test_inversion_and_inpainting(solver):
     mask = torch.zeros(1, 1, 4, 16, dtype=torch.bool, device="meta")
     with OneDevice():
         trajectory = invert(sit.velocity, x, ode_times(3), solver)
-        start = renoised(trajectory, mask, spherical_mean(x, x, 0.5))
-        assert kept(trajectory, mask)(start, 0.0, 3).shape == x.shape
+        start = noise_inside_mask(trajectory, mask, slerp(x, x, 0.5))
+        assert restore_outside_mask(trajectory, mask)(start, 0.0, 3).shape == x.shape
 
 
 @pytest.mark.parametrize(

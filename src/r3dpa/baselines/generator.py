@@ -12,8 +12,9 @@ from torch import Tensor, nn
 
 from r3dpa.flow.noise import scene_noise
 from r3dpa.flow.sampler import SamplerConfig
-from r3dpa.generation import SceneBatch, check_precision, filled, scene_indices
+from r3dpa.generation import check_precision, filled, scene_indices
 from r3dpa.geometry import ScanGeometry
+from r3dpa.scenes import SceneBatch
 
 FULL_SCALE = 1 - 1e-6  # of images: a saturated pixel is a return just below the largest range
 

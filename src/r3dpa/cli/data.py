@@ -9,7 +9,7 @@ from typing import Any
 from jsonargparse.typing import PositiveInt
 
 from r3dpa.cli.parser import check_file, check_folder
-from r3dpa.pretrained import DEFAULT_WEIGHTS
+from r3dpa.pretrained import DEFAULT_WEIGHTS, check_features
 
 
 def check(path: Path, *, columns: tuple[str, ...] = ()) -> None:
@@ -114,6 +114,10 @@ def objects(
         limit: Number of scans at most, evenly spread.
         device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
     """
+    check_file(out)
+    if out.suffix != ".safetensors":
+        raise ValueError(f"the library is a .safetensors file, got {out}")
+    check_features(ckpt)
     from tqdm import tqdm
 
     from r3dpa.checkpoints import read_checkpoint
@@ -125,9 +129,6 @@ def objects(
     from r3dpa.generation import SceneGenerator
     from r3dpa.io import text_table, usable_device
 
-    check_file(out)
-    if out.suffix != ".safetensors":
-        raise ValueError(f"the library is a .safetensors file, got {out}")
     source = feature_source_of(read_checkpoint(ckpt))
     generator = SceneGenerator.from_checkpoint(ckpt, device="cpu")
     projection, sit = generator.geometry.projection, generator.sit

@@ -9,6 +9,7 @@ from typing import Any
 from jsonargparse.typing import PositiveInt
 
 from r3dpa.cli.parser import EditOptions
+from r3dpa.pretrained import check_features
 
 
 def inpaint(
@@ -28,7 +29,7 @@ def inpaint(
 ) -> str:
     """Generate a part of a scan anew, as an object if one is named.
 
-    The part is one of --box, --box3d and --mask; pixels outside it stay those of the scan. The
+    The part is one of --box, --box3d and --mask; pixels outside it keep the scan's values. The
     object is a class of a library (--objects FILE --object car); without one the edit is unguided.
     Azimuth 0 looks forward and grows to the left; 180 is behind.
 
@@ -39,19 +40,14 @@ def inpaint(
         mask: Picture of H x W pixels as the range image, bright where it is to change.
         objects: File of ``r3dpa data objects``, made with the feature source of the checkpoint.
         object: Class of that file.
-        strength: Guidance in velocities, 0 to 1; default: 0.5.
+        strength: Guidance relative to the velocity, 0 to 1; default: 0.5.
         window: First and last guided time; 0 data, 1 noise; default: all.
         start: First time of the edit; below 1 keeps some of the original part.
-        dilation: Rings of tokens around the part to generate too; pixels outside are restored.
+        dilation: Rings of tokens around the part to generate as well; pixels outside are restored.
         num: Number of results, one per seed index.
         **options: See :class:`EditOptions`.
     """
     arguments = dict(locals())
-    from r3dpa.cli.edit_session import EditSession
-    from r3dpa.cli.scene_files import feature_source_of
-    from r3dpa.editing import regions
-    from r3dpa.editing.objects import ObjectLibrary
-
     if sum(region is not None for region in (box, box3d, mask)) != 1:
         raise ValueError("give one of --box, --box3d and --mask: the part that is to change")
     if (objects is None) != (object is None):
@@ -60,6 +56,13 @@ def inpaint(
         )
     if objects is None and (strength, window) != (None, None):
         raise ValueError("--strength and --window need --object")
+    if objects is not None:
+        check_features(EditOptions(**options).ckpt)
+    from r3dpa.cli.edit_session import EditSession
+    from r3dpa.cli.scene_files import feature_source_of
+    from r3dpa.editing import regions
+    from r3dpa.editing.objects import ObjectLibrary
+
     session = EditSession(EditOptions(**options), num, strength, window)
     source = session.read(scan)
     if mask is not None:
@@ -73,7 +76,7 @@ def inpaint(
         library = ObjectLibrary.load(objects)
         library.check_source(feature_source_of(session.checkpoint), session.sit.feature_dim)
         feature = library.feature(object)
-    run = partial(session.editor.inpaint, source.range_m, region, num, session.options.seed)
+    run = partial(session.editor.inpaint, source.pixels, region, num, session.options.seed)
     run = partial(run, feature=feature, start=start, dilation=dilation)
     scans, names = {f"scan {scan.stem}": source}, ("kept", object or "generated anew")
     return session.write("inpaint", arguments, scans, run, region, names, feature is not None)
@@ -102,12 +105,13 @@ def mix(
         split: Azimuth in degrees where the left half starts; it ends half a turn further.
         blend: Width of the seams in degrees.
         features_ckpt: Weights of the feature source, if it has none of its own.
-        strength: Guidance in velocities, 0 to 1.
+        strength: Guidance relative to the velocity, 0 to 1.
         window: First and last guided time; 0 data, 1 noise.
         num: Number of results, one per seed index.
         **options: See :class:`EditOptions`.
     """
     arguments = dict(locals())
+    check_features(EditOptions(**options).ckpt)
     from r3dpa.cli.edit_session import EditSession
     from r3dpa.editing.regions import mask_of_tokens, sector_weights
 
@@ -132,84 +136,53 @@ def complete(
     mask: Path | None = None,
     start: float | None = None,
     resamplings: PositiveInt | None = None,
-    num: PositiveInt = 8,
+    num: PositiveInt = 1,
+    workers: PositiveInt = 1,
     **options: Any,
 ) -> str:
-    """Fill a missing sector, dropped beams, or any pixels of a scan.
+    """Fill a missing sector, dropped beams, or any pixels of a scan or a folder of scans.
 
-    All named gaps are filled; where the scan has returns in them, the result is compared with
-    these. Azimuth 0 looks forward and grows to the left; 180 is behind. R2DM and R2Flow complete by
+    Every point of a scan comes back as it was, in its format and order; generated points follow,
+    where the scan has none. ``range_m.npy`` holds the completed images; where the scan has returns
+    in what is missing, these are not read, and errors of the completion, of linear interpolation
+    and of the nearest beam are compared. The completion aims at a small error: large parts are made
+    up by ``r3dpa edit inpaint``.
+
+    Azimuth 0 looks forward and grows to the left; 180 is behind. R2DM and R2Flow complete by
     RePaint, LiDM its latents, all in ``--steps`` intervals from noise; they read no other option
-    of the solver.
+    of the solver, R3DPA reads none. ``--formats`` is not read.
 
     Args:
-        scan: Scan to complete: ``.bin``, ``.ply``, or ``.npz`` of one scan.
+        scan: Scan or folder of scans to complete: .bin, .pcd.bin, .pcd, .ply, .npy, .npz.
         sector: Azimuth from and to, counted to the left, degrees.
-        keep_every: Keep the first of so many beams: 2 makes 64 of 32, 4 of 16.
-        empty_beams: Rows without a return are missing, as in a scan of fewer beams.
+        keep_every: Keep every n-th beam and fill the rest: 2 upsamples 32 beams to 64.
+        empty_beams: Fill what the beams do not reach, as in a scan of fewer beams: rows without a
+            return, and empty pixels between two returns at most 8 rows apart.
         other_sensor: Keep what so many beams between two inclinations (degrees) see: ``32 -25 3``.
         mask: Picture of H x W pixels as the range image, bright where it is missing.
-        start: Time at which R3DPA starts, in (0, 1], default 0.3; large gaps need more.
+        start: Time of the noise that R3DPA adds, in (0, 1]; default: 0.2.
         resamplings: How often RePaint crosses each interval; default: 10.
-        num: Number of results, one per seed index.
+        num: Number of results per scan, which differ little.
+        workers: Processes that complete scans of a folder.
         **options: See :class:`EditOptions`.
     """
     arguments = dict(locals())
-    from dataclasses import replace
-
-    import torch
-
-    from r3dpa.cli.edit_session import EditSession, held_out_errors
-    from r3dpa.editing import regions
-    from r3dpa.geometry import SphericalProjection
-
-    session = EditSession(EditOptions(**options), num)
-    stage = session.checkpoint.stage
-    if start is not None and session.baseline is not None:
-        raise ValueError(f"--start is for R3DPA: stage {stage} starts from noise")
-    if resamplings is not None and stage not in ("r2dm", "r2flow"):
-        raise ValueError(f"--resamplings is for R2DM and R2Flow, not for stage {stage}")
-    projection, rows = session.projection, session.sensor.beams
-    masks = []
-    if sector is not None:
-        masks.append(regions.sector(projection, *sector))
-    if keep_every is not None:
-        if not 2 <= keep_every <= rows // 2:
-            raise ValueError(f"--keep_every must be 2 to {rows // 2}, got {keep_every}")
-        masks.append(regions.dropped_beams(projection, range(0, rows, keep_every)))
-    if other_sensor is not None:
-        count, low, high = other_sensor
-        sensor = replace(
-            session.sensor, beams=count, inclination_min_deg=low, inclination_max_deg=high
-        )
-        masks.append(regions.sensor_pair(projection, SphericalProjection(sensor)))
-    if mask is not None:
-        masks.append(session.read_mask(mask))
-    source = session.read(scan, check=False)
-    if empty_beams:
-        empty = ~(source.range_m > 0).any(dim=1, keepdim=True)
-        masks.append(empty.expand_as(source.range_m))
-    if not masks:
+    given = (sector, keep_every, other_sensor, mask)
+    if not empty_beams and all(value is None for value in given):
         raise ValueError(
             "nothing is missing: give --sector, --keep_every, --empty_beams, --other_sensor or "
             "--mask"
         )
-    missing = regions.check_mask(torch.stack(masks).any(dim=0), "all that is missing")
-    session.check(source, missing)
-    known = source._replace(range_m=torch.where(missing, -1.0, source.range_m))
-    if session.baseline is not None:
-        run = partial(session.complete, source, missing, resamplings or 10)
-    else:
-        run = partial(session.editor.complete, source.range_m, missing, num, session.options.seed)
-        run = partial(run, start=0.3 if start is None else start)
-    scans = {f"scan {scan.stem}": source, "known part": known}
-    measure = partial(held_out_errors, range_m=source.range_m, missing=missing)
-    names = ("kept", "missing")
-    return session.write("complete", arguments, scans, run, missing, names, measure=measure)
+    from r3dpa.cli.edit_complete import MissingPixels, complete_files
+
+    missing = MissingPixels(sector, keep_every, empty_beams, other_sensor, mask)
+    return complete_files(
+        scan, EditOptions(**options), missing, arguments, num, start, resamplings, workers
+    )
 
 
 def vary(*, scan: Path, start: float = 0.5, num: PositiveInt = 8, **options: Any) -> str:
-    """Generate scenes similar to a scan: part of the way to noise and back.
+    """Generate scenes like a scan: part of the way to noise and back.
 
     Args:
         scan: Scan to vary: ``.bin``, ``.ply``, or ``.npz`` of one scan.
@@ -222,26 +195,26 @@ def vary(*, scan: Path, start: float = 0.5, num: PositiveInt = 8, **options: Any
 
     session = EditSession(EditOptions(**options), num)
     source = session.read(scan)
-    run = partial(session.editor.vary, source.range_m, num, session.options.seed, start=start)
+    run = partial(session.editor.vary, source.pixels, num, session.options.seed, start=start)
     return session.write("vary", arguments, {f"scan {scan.stem}": source}, run)
 
 
 def interpolate(*, left: Path, right: Path, frames: int = 8, **options: Any) -> str:
-    """Generate the scenes on the way from one scan to another, through noise.
+    """Generate scenes on the way from one scan to another, through noise.
 
     Args:
         left: Scan of the first frame: ``.bin``, ``.ply``, or ``.npz`` of one scan.
         right: Scan of the last frame.
-        frames: Number of scenes, both ends among them.
+        frames: Number of scenes, both ends included.
         **options: See :class:`EditOptions`.
     """
     arguments = dict(locals())
-    from r3dpa.cli.edit_session import EditSession
-
     if frames < 2:
         raise ValueError(f"frames must be at least 2, the two scans; got {frames}")
+    from r3dpa.cli.edit_session import EditSession
+
     session = EditSession(EditOptions(**options), frames)
     first, last = session.read(left), session.read(right)
-    run = partial(session.editor.interpolate, first.range_m, last.range_m, frames)
+    run = partial(session.editor.interpolate, first.pixels, last.pixels, frames)
     scans = {f"left: {left.stem}": first, f"right: {right.stem}": last}
     return session.write("interpolate", arguments, scans, run)

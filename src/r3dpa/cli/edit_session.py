@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from lidarsim.recorded import RecordedScan
 from lidarsim.scan_files import out_of_range
 from r3dpa import viz
 from r3dpa.baselines import BASELINES, scene_generator
@@ -26,32 +27,38 @@ from r3dpa.data import PointSample, Scan, ScanError, pooled_grids
 from r3dpa.data.images import read_mask
 from r3dpa.data.scene_writer import SceneWriter
 from r3dpa.editing import EditResult, EditSettings, SceneEditor
-from r3dpa.editing.gaps import check_view, filled, range_error_m
+from r3dpa.editing.gaps import check_view, in_view
 from r3dpa.editing.regions import check_mask
 from r3dpa.features import feature_source
 from r3dpa.flow.sampler import SamplerConfig
 from r3dpa.flow.solvers import evaluations
-from r3dpa.generation import SceneBatch
-from r3dpa.geometry import in_range, range_image
+from r3dpa.geometry import Pixels, in_range, project_pixels
 from r3dpa.io import atomic_path, usable_device, write_text
 from r3dpa.nn import VelocityNetwork
+from r3dpa.scenes import SceneBatch
 
 _SHOWN = 8  # results on the sheet and the page
 
 
 class ScanView(NamedTuple):
-    """A scan: its file, points ``(P, 4)``, range image and intensity ``(H, W)``."""
+    """A scan: its file, points ``(P, 4)``, range image, intensity and classes ``(H, W)``."""
 
     path: Path
     points: Tensor
     range_m: Tensor
     intensity: Tensor
+    classes: Tensor | None = None
+
+    @property
+    def pixels(self) -> Pixels:
+        """What the model is given."""
+        return Pixels(self.range_m, self.intensity, self.classes)
 
 
 class EditSession:
     """A checkpoint opened for one edit with ``num`` results; None is the default guidance.
 
-    Baselines can only complete scans: for them, ``editor`` is a ``ValueError``.
+    Baselines can only complete scans: for them, ``editor`` raises a ValueError.
     """
 
     def __init__(
@@ -97,8 +104,8 @@ class EditSession:
         """Velocity network of the editor."""
         return self.editor.generator.sit
 
-    def read(self, path: Path, check: bool = True) -> ScanView:
-        """A scan; with ``check``, one that fills the field of view."""
+    def read(self, path: Path) -> ScanView:
+        """Read a scan, which must fill the field of view."""
         clouds = read_clouds(path)
         if len(clouds) > 1:
             names = ", ".join(list(clouds)[:3])
@@ -108,17 +115,44 @@ class EditSession:
         points[:, : cloud.shape[1]] = torch.from_numpy(cloud.copy())
         if not points.isfinite().all():
             raise ScanError(f"{path}: has NaN or infinite values")
-        if not in_range(points[:, :3], self.sensor).any():
-            raise out_of_range(path, self.sensor)
-        range_m, values = range_image(points[:, :3], self.projection, points[:, 3:])
-        assert values is not None
-        scan = ScanView(path, points, range_m, values[0])
-        if check:
-            self.check(scan)
+        scan = self._project(path, points)
+        self.check(scan)
         return scan
 
+    def view(self, path: Path, scan: RecordedScan, only_in_view: bool = False) -> ScanView:
+        """View of a scan that was read; unchecked.
+
+        ``only_in_view`` leaves out points above and below the field of view, which otherwise land
+        in the first and last row.
+        """
+        points = torch.zeros(len(scan), 4)
+        points[:, :3] = torch.from_numpy(scan.points)
+        if scan.intensity is not None:
+            points[:, 3] = torch.from_numpy(scan.intensity.astype(np.float32))
+        labels = None
+        if scan.labels is not None:
+            labels = torch.from_numpy(scan.labels.astype(np.int64))
+        return self._project(path, points, labels, only_in_view)
+
+    def _project(
+        self,
+        path: Path,
+        points: Tensor,
+        labels: Tensor | None = None,
+        only_in_view: bool = False,
+    ) -> ScanView:
+        if not in_range(points[:, :3], self.sensor).any():
+            raise out_of_range(path, self.sensor)
+        seen = points
+        if only_in_view:
+            outside = ~in_view(points[:, :3], self.projection)
+            seen = points.masked_fill(outside[:, None], torch.nan)  # in no pixel
+        pixels = project_pixels(seen, self.projection, labels)
+        assert pixels.intensity is not None
+        return ScanView(path, points, pixels.range_m, pixels.intensity, pixels.classes)
+
     def check(self, scan: ScanView, missing: Tensor | None = None) -> None:
-        """Refuses a scan that does not fill the field of view outside ``missing`` ``(H, W)``."""
+        """Refuse a scan that does not fill the field of view outside ``missing`` ``(H, W)``."""
         try:
             check_view(scan.points[:, :3], scan.range_m, self.projection, missing)
         except ValueError as error:
@@ -127,7 +161,7 @@ class EditSession:
     def complete(self, scan: ScanView, missing: Tensor, resamplings: int) -> EditResult:
         """Completions of a scan by a baseline; pixels that are not missing stay."""
         image, size = self.geometry.codec.to_image(scan.range_m, scan.intensity), self.num
-        made: list[SceneBatch] = [
+        batches: list[SceneBatch] = [
             self.baseline.complete(
                 image,
                 ~missing,
@@ -139,13 +173,13 @@ class EditSession:
         ]
 
         def joined(name: str) -> Tensor:
-            return torch.cat([getattr(batch, name) for batch in made]).cpu()
+            return torch.cat([getattr(batch, name) for batch in batches]).cpu()
 
         intensity = None
         if self.geometry.codec.reflectance:
             intensity = torch.where(missing, joined("intensity"), scan.intensity)
         ranges = torch.where(missing, joined("range_m"), scan.range_m)
-        return EditResult(ranges, joined("latents"), made[0].nfe, self.projection, intensity)
+        return EditResult(ranges, joined("latents"), batches[0].nfe, self.projection, intensity)
 
     def read_mask(self, path: Path) -> Tensor:
         """Mask ``(H, W)`` of a picture; refused if it selects nothing or all."""
@@ -159,8 +193,8 @@ class EditSession:
         for path, points, *_ in scans:
             file = Scan(path.parent.name, path.stem, path)
             sample = PointSample(file, file.cache_key, points, extractor.prepare(points))
-            found = pooled_grids(extractor, [sample], self.projection, [self.sit.grid_size])
-            grids.append(found[self.sit.grid_size][0].clone())
+            by_size = pooled_grids(extractor, [sample], self.projection, [self.sit.grid_size])
+            grids.append(by_size[self.sit.grid_size][0].clone())
         return grids
 
     def write(
@@ -172,24 +206,15 @@ class EditSession:
         parts: Tensor | None = None,
         part_names: Sequence[str] = (),
         guided: bool = False,
-        measure: Callable[[Tensor], dict[str, Any]] | None = None,
     ) -> str:
-        """Runs an edit and writes scenes, pictures, page and metadata; returns a summary.
+        """Run an edit and write scenes, pictures, page and metadata; return a summary.
 
-        ``arguments`` are its own options, for the metadata; ``parts`` ``(H, W)`` says to which of
-        the named parts each pixel belongs; ``measure`` takes the results ``(B, H, W)`` to their
-        errors where the scan was held out.
+        ``arguments`` are the options of the command, for the metadata; ``parts`` ``(H, W)`` says
+        to which of the named parts each pixel belongs.
         """
-        options, settings = self.options, asdict(self.settings)
-        if not guided:
-            del settings["strength"], settings["window"]
-        if self.baseline is not None:
-            settings = {"steps": options.steps}
-        own = {name: value for name, value in arguments.items() if name not in ("options", "num")}
-        request = own | provenance(self.checkpoint, options, self.num, self.device, self.geometry)
-        request |= {"command": command, "guided": guided, "settings": settings}
-        request["scans"] = {name: scan.path for name, scan in scans.items()}
-        request = json.loads(json.dumps(request, default=str))  # paths as text
+        options = self.options
+        paths = {name: scan.path for name, scan in scans.items()}
+        request = self.request(command, arguments, {"scans": paths}, guided)
         with SceneWriter(
             options.out, self.num, self.projection, options.formats, request, options.overwrite
         ) as writer:
@@ -197,17 +222,13 @@ class EditSession:
             with self._progress(command):
                 result = run()
             seconds = time.perf_counter() - start
-            intensity = result.intensity
-            if intensity is not None:
-                intensity = intensity[writer.num_done :]
-            writer.put(result.range_m[writer.num_done :].contiguous(), result.nfe, intensity)
+            todo = result[writer.num_done :]
+            writer.put(todo.range_m.contiguous(), todo.nfe, todo.intensity, todo.labels)
             writer.close()
-            self._show(command, scans, result.range_m, parts, part_names)
+            self.show(command, scans, result.range_m, parts, part_names)
             measured = ("nfe", "vae_error_m", "round_trip_m")
             request |= {name: getattr(result, name) for name in measured} | {"seconds": seconds}
             request["cosine"] = None if result.cosine is None else result.cosine.tolist()
-            if measure is not None:
-                request["held_out"] = measure(result.range_m)
             writer.finish(request)
         return (
             f"{command}: {self.num} scenes in {options.out}, {result.nfe} network evaluations each,"
@@ -215,14 +236,31 @@ class EditSession:
             f"open {options.out / 'edit.png'} and {options.out / 'edit.html'}"
         )
 
+    def request(
+        self,
+        command: str,
+        arguments: Mapping[str, Any],
+        sources: Mapping[str, Any],
+        guided: bool = False,
+    ) -> dict[str, Any]:
+        """All that determines the results of a command, as JSON values."""
+        options, settings = self.options, asdict(self.settings)
+        if not guided:
+            del settings["strength"], settings["window"]
+        if self.baseline is not None:
+            settings = {"steps": options.steps}
+        left_out = ("options", "num", "workers")
+        request = {name: value for name, value in arguments.items() if name not in left_out}
+        request |= provenance(self.checkpoint, options, self.num, self.device, self.geometry)
+        request |= {"command": command, "guided": guided, "settings": settings, **sources}
+        return dict(json.loads(json.dumps(request, default=str)))  # paths as text
+
     @contextmanager
     def _progress(self, command: str) -> Iterator[None]:
-        """Bar of network evaluations of whole batches; the total is that of a full way and back."""
+        """Bar of network evaluations of whole batches, to noise and back."""
         steps = evaluations(self.options.solver, self.options.steps)
         batches = math.ceil(self.num / self.options.batch_size)
-        total: int | None = steps * (batches + 1)
-        if command == "complete":
-            total = None if self.baseline is not None else self.num * self.options.steps
+        total = steps * (batches + 1)
         with tqdm(total=total, unit="evaluation", desc=command, disable=None) as bar:
 
             def count(*_: Any) -> None:  # what a hook returns would become the output
@@ -231,7 +269,7 @@ class EditSession:
             with self._called.register_forward_hook(count):
                 yield
 
-    def _show(
+    def show(
         self,
         command: str,
         scans: Mapping[str, ScanView],
@@ -239,6 +277,7 @@ class EditSession:
         parts: Tensor | None,
         part_names: Sequence[str],
     ) -> None:
+        """Write ``before.npy``, pictures and the page of scans and results ``(B, H, W)``."""
         out = self.options.out
         before = {name: scan.range_m for name, scan in scans.items()}
         images = torch.stack(list(before.values()))
@@ -260,22 +299,3 @@ class EditSession:
         title = f"r3dpa {command}"
         page = viz.edit_page(before, after, numbers, part_names, self.projection, title)
         write_text(out / "edit.html", page)
-
-
-def held_out_errors(made: Tensor, range_m: Tensor, missing: Tensor) -> dict[str, Any]:
-    """Errors of completions ``(B, H, W)`` on the returns of the scan, beside interpolations.
-
-    Ranges are compared where the scan and all methods have a return; empty without any there.
-    """
-    if not ((range_m > 0) & missing).any():
-        return {}
-    methods = {"completed": made}
-    methods |= {how: filled(range_m, missing, how)[None] for how in ("nearest", "linear")}
-    common = missing & (torch.cat(list(methods.values())) > 0).all(dim=0)
-    return {
-        name: {
-            "mae_m": range_error_m(images, range_m.expand_as(images), common),
-            "same_returns": ((images > 0) == (range_m > 0))[:, missing].double().mean().item(),
-        }
-        for name, images in methods.items()
-    }

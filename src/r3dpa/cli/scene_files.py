@@ -29,6 +29,7 @@ from r3dpa.data.scene_writer import SceneWriter
 from r3dpa.generation import SceneGenerator
 from r3dpa.geometry import ScanGeometry, points_of
 from r3dpa.io import source_commit, write_text
+from r3dpa.pretrained import without_features
 
 # Colours that people expect (plants are green), and quiet ones for what is everywhere; a category
 # that is not named here takes one of the palette.
@@ -55,12 +56,9 @@ def written(path: Path) -> str:
 
 
 def feature_source_of(checkpoint: Checkpoint) -> str:
-    """Feature source of a checkpoint; ``ValueError`` if it was trained without."""
+    """Feature source of a checkpoint; raises a ValueError if it was trained without."""
     if checkpoint.feature_source is None:
-        raise ValueError(
-            f"{checkpoint.path} was trained without 3D features, so that none can guide it; give a "
-            "checkpoint of a run with an extractor"
-        )
+        raise without_features(checkpoint.path)
     return checkpoint.feature_source
 
 

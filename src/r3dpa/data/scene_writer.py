@@ -27,7 +27,7 @@ _CLOUD_WRITERS: dict[str, Callable[[Path, Tensor], None]] = {"bin": write_bin, "
 #: Files that ``r3dpa sample`` and the edits write beside their metadata.
 _WRITTEN = (
     *(*_CLOUD_WRITERS, "range_m.npy", "scenes.npz", "range", "birds_eye", "scene_3d"),
-    *("before.npy", "mask.png", "edit.png", "edit.html", "labels"),
+    *("before.npy", "mask.png", "edit.png", "edit.html", "labels", "scans"),
 )
 
 

@@ -1,33 +1,41 @@
 """Edits of scans with an unconditional model: inpaint, mix, complete, vary, interpolate.
 
-Arguments outside the ranges that the docstrings state are a ``ValueError``.
+Scans are given as :data:`r3dpa.scenes.ScanLike`, masks as bool NumPy arrays or tensors; results
+hold tensors on the CPU. Arguments outside the ranges that the docstrings state raise a ValueError.
 Letters: B scenes, S sources, H beams, W columns, C latent channels, h x w latent size, N tokens,
 F feature width.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Literal, Self
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from r3dpa.checkpoints import Checkpoint
-from r3dpa.editing.gaps import filled, range_error_m, refined
-from r3dpa.editing.latents import Trajectory, invert, kept, renoised, spherical_mean
+from r3dpa.editing.gaps import (
+    blend_completion,
+    interpolate_gaps,
+    median_draw,
+    range_error_m,
+)
+from r3dpa.editing.latents import Trajectory, invert, noise_inside_mask, restore_outside_mask, slerp
 from r3dpa.editing.regions import check_mask, mask_of_tokens, token_mask
 from r3dpa.flow.guidance import FeatureGuidance, FeatureTarget
 from r3dpa.flow.noise import scene_noise
 from r3dpa.flow.solvers import ODE_SOLVERS, AfterStep, Velocity, evaluations, ode_solver, unchanged
 from r3dpa.flow.times import batch_time, check_interval, ode_times
-from r3dpa.generation import SamplerConfig, SceneBatch, SceneGenerator, scene_indices
+from r3dpa.generation import SamplerConfig, SceneGenerator, scene_indices
+from r3dpa.geometry import UNKNOWN_CLASS, Pixels, labels_of
+from r3dpa.scenes import ScanLike, SceneBatch, map_pixels, scan_pixels
 
-_FIT_STEPS, _FIT_RATE = 3, 0.05  # of Adam, at each time of a completion
-_FIT_SMOOTH = 0.01  # of encoded range: errors below count by their square
-_FIT_EPS = 0.1  # of the gradient's length: less would make steps of the rounding of small ones
+_COMPLETION_DRAWS = 3  # their median has a smaller error than one draw
 
 
 @dataclass(frozen=True)
@@ -37,10 +45,10 @@ class EditSettings:
     Args:
         solver: A key of :data:`r3dpa.flow.ODE_SOLVERS`. Midpoint steps have by far the smallest
             round-trip error per evaluation.
-        steps: Solver steps of a whole way.
+        steps: Solver steps from noise to data.
         shift: Finer steps near noise (above 1) or data (below 1).
-        strength: Length of the guidance term in velocities, in [0, 1]; 0 for none.
-        window: First and last time that is guided; 0 data, 1 noise.
+        strength: Length of the guidance term relative to the velocity, in [0, 1]; 0 for none.
+        window: First and last guided time; 0 is data, 1 noise.
     """
 
     solver: str = "midpoint"
@@ -67,15 +75,16 @@ class EditSettings:
         return ode_times(self.steps, start, shift=self.shift)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class EditResult(SceneBatch):
     """Edited scenes, on the CPU; ``nfe`` includes the evaluations of an inversion.
 
     Attributes:
         vae_error_m: Mean absolute range error of the scans after encoder and decoder alone; None
-            where no scan is encoded.
+            where it is not measured.
         round_trip_m: Mean absolute range error of inversion and back without an edit, relative to
-            the same; at most this is added to ``vae_error_m``. None without inversion.
+            the reconstruction; the edit adds at most this to ``vae_error_m``. None without
+            inversion.
         cosine: ``(B,)`` mean cosine between projected features of the latents and the features
             that guided them; None without features.
     """
@@ -88,16 +97,20 @@ class EditResult(SceneBatch):
 class SceneEditor:
     """Edits scans with the networks of a generator.
 
-    The random numbers of a scene are a function of (seed, index) alone, as in the generator. The
-    solver and the guidance scale of the generator are not used. Where images have a return channel,
-    inpainted parts, mixtures and variations lose single returns at random, as its scenes do;
-    completions do not.
+    The random numbers of a scene are a function of (seed, index) alone, as in the generator, whose
+    solver and guidance scale are not used. Where images have a return channel, inpainted parts,
+    mixtures and variations lose single returns at random, as generated scenes do; completions do
+    not. Results have the intensity and labels that the VAE has.
 
     Args:
-        generator: Networks and geometry; float32. Their weights no longer require gradients, which
-            guided edits would store activations for.
+        generator: Networks and geometry; float32. Their weights stop requiring gradients, since
+            guided edits would store activations for them.
         settings: Solver and guidance.
-        batch_size: Scenes made together.
+        batch_size: Number of scenes per batch.
+
+    Example:
+        >>> editor = SceneEditor.from_checkpoint("r3dpa-s")  # doctest: +SKIP
+        >>> editor.vary("scan.bin", 4, start=0.3).save("variations")  # doctest: +SKIP
     """
 
     def __init__(
@@ -115,6 +128,13 @@ class SceneEditor:
         self._nfe = evaluations(settings.solver, settings.steps)
         for network in (generator.sit, generator.vae):
             network.requires_grad_(False)
+
+    def __repr__(self) -> str:
+        sensor, settings = self.generator.geometry.projection.sensor, self.settings
+        return (
+            f"SceneEditor({sensor.beams} x {sensor.columns} pixels, {settings.solver}, "
+            f"{settings.steps} steps, {self.generator.device})"
+        )
 
     @classmethod
     def from_checkpoint(
@@ -135,16 +155,26 @@ class SceneEditor:
     from_pretrained = from_checkpoint  # names of `r3dpa models`
 
     @torch.no_grad()
-    def encode(self, range_m: Tensor) -> Tensor:
-        """Normalised latents ``(B, C, h, w)`` of range images ``(B, H, W)``, means of the VAE."""
-        image = self.generator.geometry.codec.to_image(range_m.to(self.generator.device))
-        return self.generator.latent_norm.normalise(self.generator.vae.encode(image).mean)
+    def encode(self, scan: ScanLike) -> Tensor:
+        """Return the normalised latents ``(B, C, h, w)``, means of the VAE.
+
+        Args:
+            scan: One scan, or range images ``(B, H, W)`` in metres. VAEs with intensity need scans
+                with one in [0, 1].
+        """
+        if isinstance(scan, Tensor | np.ndarray) and scan.ndim == 3:
+            return self._encode(Pixels(torch.as_tensor(scan)))
+        return self._encode(_batch_of(self.pixels(scan)))
+
+    def pixels(self, scan: ScanLike) -> Pixels:
+        """Pixels ``(H, W)`` of a scan in the projection of the model, on the CPU."""
+        return scan_pixels(scan, self.generator.geometry.projection)
 
     @torch.no_grad()
     def inpaint(
         self,
-        range_m: Tensor,
-        pixel_mask: Tensor,
+        scan: ScanLike,
+        pixel_mask: Tensor | np.ndarray,
         indices: int | Sequence[int],
         seed: int = 0,
         *,
@@ -155,48 +185,48 @@ class SceneEditor:
         """Generate the inside of a mask anew, guided towards an object.
 
         The scan is inverted, the tokens that the mask touches get fresh noise, and on the way back
-        all others are restored after every step. Pixels outside the mask are those of the scan.
+        all others are restored after every step. Pixels outside the mask keep the scan's values.
 
-        Source: R3DPA (ICRA 2026), object inpainting; there the other tokens are not put back.
+        Source: R3DPA (ICRA 2026), object inpainting; there the other tokens are not restored.
 
         Args:
-            range_m: ``(H, W)`` metres, -1 without a return.
+            scan: The scan to change.
             pixel_mask: ``(H, W)`` bool, True where the scan is to change; neither empty nor full,
                 in tokens too.
             indices: Numbers of the results, or how many.
-            seed: Number of their collection.
+            seed: Seed of the results; each depends on (seed, number) alone.
             feature: ``(F,)`` feature of the object. Default: no guidance.
             start: Time that the way back starts from, in (0, 1]; below 1 part of the content stays.
-            dilation: Rings of tokens around those of the mask that are generated anew too.
+            dilation: Rings of tokens around the mask that are generated anew as well.
         """
-        times = self.settings.times(start)
-        check_mask(pixel_mask, "mask")
+        times, pixels = self.settings.times(start), self.pixels(scan)
+        pixel_mask = check_mask(torch.as_tensor(pixel_mask), "mask")
         tokens = token_mask(pixel_mask, self._sit.grid_size, dilation=dilation)
         tokens = tokens.to(self.generator.device)
         edited = mask_of_tokens(tokens, self._sit.grid_size, self._sit.input_size)[None, None]
-        latents = self.encode(range_m[None])
+        latents = self._encode(_batch_of(pixels))
         trajectory = self._inverted(latents, times)
 
         def solve(noise: Tensor) -> tuple[Tensor, FeatureGuidance | None]:
-            own = trajectory._replace(states=trajectory.states.expand(-1, len(noise), -1, -1, -1))
+            way = trajectory._replace(states=trajectory.states.expand(-1, len(noise), -1, -1, -1))
             guidance = None
             if feature is not None:
                 target = feature.to(noise).expand(len(noise), tokens.numel(), -1)
                 guidance = self._guidance(FeatureTarget(target, tokens.expand(len(noise), -1)))
-            state = renoised(own, edited, noise, self.generator.interpolant)
+            state = noise_inside_mask(way, edited, noise, self.generator.interpolant)
             velocity = guidance or self._sit.velocity
-            return self._solve(velocity, state, times, kept(own, edited)), guidance
+            return self._solve(velocity, state, times, restore_outside_mask(way, edited)), guidance
 
-        made, cosine = self._each(indices, seed, solve)
-        pasted = torch.where(pixel_mask, self._decoded(made, indices, seed), range_m)
-        errors = self._errors(range_m[None], latents, trajectory)
-        return self._result(pasted, made, 2 * self._nfe, *errors, cosine)
+        edits, cosine = self._in_batches(indices, seed, solve)
+        pasted = _paste(self._decoded(edits, indices, seed), pixels, pixel_mask)
+        errors = self._errors(pixels.range_m[None], latents, trajectory)
+        return self._result(pasted, edits, 2 * self._nfe, *errors, cosine)
 
     @torch.no_grad()
     def mix(
         self,
-        features: Sequence[Tensor],
-        token_weights: Tensor,
+        features: Sequence[Tensor | np.ndarray],
+        token_weights: Tensor | np.ndarray,
         indices: int | Sequence[int],
         seed: int = 0,
     ) -> EditResult:
@@ -208,140 +238,144 @@ class SceneEditor:
             features: S feature grids ``(N, F)``; zero in cells without points.
             token_weights: ``(S, N)``, see :func:`r3dpa.editing.regions.sector_weights`.
             indices: Numbers of the results, or how many.
-            seed: Number of their collection.
+            seed: Seed of the results; each depends on (seed, number) alone.
         """
         times = self.settings.times(1.0)
-        stitched = FeatureTarget.stitched([grid[None] for grid in features], token_weights).features
+        grids = [torch.as_tensor(grid)[None] for grid in features]
+        stitched = FeatureTarget.stitched(grids, torch.as_tensor(token_weights)).features
 
         def solve(noise: Tensor) -> tuple[Tensor, FeatureGuidance]:
             guidance = self._guidance(FeatureTarget(stitched.to(noise).expand(len(noise), -1, -1)))
             return self._solve(guidance, noise, times), guidance
 
-        made, cosine = self._each(indices, seed, solve)
-        return self._result(self._decoded(made, indices, seed), made, self._nfe, cosine=cosine)
+        scenes, cosine = self._in_batches(indices, seed, solve)
+        decoded = self._decoded(scenes, indices, seed)
+        return self._result(decoded, scenes, self._nfe, cosine=cosine)
 
     @torch.no_grad()
     def complete(
         self,
-        range_m: Tensor,
-        missing: Tensor,
-        indices: int | Sequence[int],
+        scan: ScanLike,
+        missing: Tensor | np.ndarray,
+        indices: int | Sequence[int] = 1,
         seed: int = 0,
         *,
-        start: float = 0.3,
+        start: float = 0.2,
     ) -> EditResult:
         """Fill missing pixels of a scan: a sector, beams, or any others.
 
-        Plug-and-play with the flow as denoiser, in latents: the encoder sees the scan with its
-        gaps interpolated; then, at every time t from ``start`` down, the latents x get
-
-        1. some steps of Adam on the absolute error, smoothed at 0, of the decoded known pixels,
-        2. fresh noise and the expected data, ``x <- D((1 - t) x + t noise, t)``.
-
-        The decoded image is adjusted to known beams nearby, see
-        :func:`r3dpa.editing.gaps.refined`. Known pixels are those of the scan. Tokens cannot be
-        restored as in :meth:`inpaint`: with missing beams none is known, and the encoder would
-        spread empty pixels over all latents.
-
-        Source: PnP-Flow (Martin et al. 2025), alg. 3, with the data term behind the decoder.
+        The scan with its gaps interpolated is encoded, carried to the time ``start`` with fresh
+        noise, and denoised in one evaluation, three times (SDEdit, Meng et al. 2022, with a single
+        step). The median of the decoded images says where returns are, and takes part in their
+        range where interpolation is uncertain, see
+        :func:`r3dpa.editing.gaps.blend_completion`. Other pixels keep the scan's values. The aim
+        is a small error; to make up a large part, use :meth:`inpaint`.
 
         Args:
-            range_m: ``(H, W)`` metres, -1 without a return.
+            scan: The scan to complete.
             missing: ``(H, W)`` bool, neither empty nor full; the scan is not read there.
-            indices: Numbers of the results, or how many.
-            seed: Number of their collection.
-            start: First time, in (0, 1]; 1 discards the interpolation, which only large gaps need.
+            indices: Numbers of the results, or how many; they differ little.
+            seed: Seed of the results; each depends on (seed, number) alone.
+            start: Time of the noise, in (0, 1]; larger values rely less on the interpolation.
         """
-        check_mask(missing, "mask of what is missing")
-        times = self.settings.times(start).tolist()
-        guess = filled(range_m, missing)
-        latents = self.encode(guess[None])
-        image = self.generator.geometry.codec.to_image(range_m).to(latents)
-        known = (~missing & self.generator.geometry.codec.informative(image)).to(latents)
-
-        def solve(noise: Tensor, draws: Iterator[Tensor]) -> Tensor:
-            x = latents.expand(len(noise), -1, -1, -1)
-            for now in times[:-1]:
-                x = self._fitted(x, image, known)
-                time = batch_time(now, x)
-                noisy = self.generator.interpolant.interpolate(x, noise, time)
-                velocity = self._sit.velocity(noisy, time)
-                x = self.generator.interpolant.denoise(velocity, noisy, time)
-                noise = next(draws)
-            return self._fitted(x, image, known)
-
-        parts = []
-        # One by one: fitting enlarges the rounding of another batch size.
+        missing = check_mask(torch.as_tensor(missing), "mask of what is missing")
+        if not 0 < start <= 1:
+            raise ValueError(f"start must be a time above 0 (scan) up to 1 (noise), got {start:g}")
+        pixels = self.pixels(scan)
+        latents = self._encode(_batch_of(_interpolated(pixels, missing)))
+        path, shape = self.generator.interpolant, self.generator.latent_shape
+        completed, means = [], []
         for index in scene_indices(indices):
-            draws = self._draws([index], seed)
-            parts.append(solve(next(draws), draws))
-        made = torch.cat(parts)
-        completed = torch.stack([refined(one, range_m, missing) for one in self._decoded(made)])
-        errors = self._errors(range_m[None], self.encode(range_m[None]), None)
-        pasted = torch.where(missing, completed, range_m)
-        return self._result(pasted, made, len(times) - 1, errors[0])
+            draws = islice(scene_noise(shape, [index], seed), _COMPLETION_DRAWS)
+            noise = torch.cat(list(draws)).to(latents)
+            time = batch_time(start, noise)
+            noisy = path.interpolate(latents.expand_as(noise), noise, time)
+            denoised = path.denoise(self._sit.velocity(noisy, time), noisy, time)
+            generated = median_draw(self._decoded(denoised))
+            range_m = blend_completion(generated.range_m, pixels.range_m, missing)
+            blended = _batch_of(generated._replace(range_m=range_m))
+            completed.append(_paste(blended, pixels, missing))
+            means.append(denoised.mean(dim=0))
+        return self._result(_concatenate(completed), torch.stack(means), _COMPLETION_DRAWS)
 
     @torch.no_grad()
     def vary(
-        self, range_m: Tensor, indices: int | Sequence[int], seed: int = 0, *, start: float = 0.5
+        self, scan: ScanLike, indices: int | Sequence[int], seed: int = 0, *, start: float = 0.5
     ) -> EditResult:
-        """Other scenes like a scan: part of the way to noise, and back.
+        """Generate scenes like a scan: part of the way to noise, and back.
 
         Source: SDEdit (Meng et al. 2022).
 
         Args:
-            range_m: ``(H, W)`` metres, -1 without a return.
+            scan: The scan to vary.
             indices: Numbers of the results, or how many.
-            seed: Number of their collection.
+            seed: Seed of the results; each depends on (seed, number) alone.
             start: Time of the noise, in (0, 1]; larger values keep less of the scan.
         """
-        times, latents = self.settings.times(start), self.encode(range_m[None])
+        times, pixels = self.settings.times(start), self.pixels(scan)
+        latents = self._encode(_batch_of(pixels))
 
         def solve(noise: Tensor) -> tuple[Tensor, None]:
             time = batch_time(start, noise)
             state = self.generator.interpolant.interpolate(latents.expand_as(noise), noise, time)
             return self._solve(self._sit.velocity, state, times), None
 
-        made, _ = self._each(indices, seed, solve)
-        error = self._errors(range_m[None], latents, None)[0]
-        return self._result(self._decoded(made, indices, seed), made, self._nfe, error)
+        variations, _ = self._in_batches(indices, seed, solve)
+        error, _ = self._errors(pixels.range_m[None], latents)
+        decoded = self._decoded(variations, indices, seed)
+        return self._result(decoded, variations, self._nfe, error)
 
     @torch.no_grad()
-    def interpolate(self, first_m: Tensor, second_m: Tensor, frames: int) -> EditResult:
-        """Scenes between two scans, on the arc between their noises.
+    def interpolate(self, first: ScanLike, second: ScanLike, frames: int) -> EditResult:
+        """Generate scenes between two scans, on the arc between their noises.
 
         Args:
-            first_m: ``(H, W)`` metres, -1 without a return; the first frame is its round trip.
-            second_m: Likewise, the last frame.
-            frames: How many, at least 2.
+            first: Scan of the first frame, which is its round trip.
+            second: Scan of the last frame.
+            frames: Number of frames, at least 2.
         """
         if frames < 2:
             raise ValueError(f"frames must be at least 2, the two scans; got {frames}")
-        times, scans = self.settings.times(1.0), torch.stack([first_m, second_m])
-        latents = self.encode(scans)
+        times = self.settings.times(1.0)
+        ends = _concatenate([_batch_of(self.pixels(scan)) for scan in (first, second)])
+        latents = self._encode(ends)
         trajectory = self._inverted(latents, times)
-        first, second = trajectory.states[0].split(1)
-        noises = [spherical_mean(first, second, k / (frames - 1)) for k in range(frames)]
+        first_noise, second_noise = trajectory.states[0].split(1)
+        noises = [slerp(first_noise, second_noise, k / (frames - 1)) for k in range(frames)]
         batches = torch.cat(noises).split(self.batch_size)
-        made = torch.cat([self._solve(self._sit.velocity, noise, times) for noise in batches])
-        errors = self._errors(scans, latents, trajectory)
-        return self._result(self._decoded(made), made, 2 * self._nfe, *errors)
+        scenes = torch.cat([self._solve(self._sit.velocity, noise, times) for noise in batches])
+        errors = self._errors(ends.range_m, latents, trajectory)
+        return self._result(self._decoded(scenes), scenes, 2 * self._nfe, *errors)
+
+    def _encode(self, pixels: Pixels) -> Tensor:
+        """Normalised latents of pixels ``(B, H, W)``."""
+        codec, device = self.generator.geometry.codec, self.generator.device
+        intensity = pixels.intensity
+        uses_intensity = codec.intensity_channel or codec.reflectance
+        if uses_intensity and intensity is not None and intensity.max() > 1:
+            raise ValueError(
+                f"the scan has intensities up to {intensity.max():g}; the model needs 0..1: divide "
+                "them by their full scale, such as 255"
+            )
+        image = codec.to_image(*map_pixels(lambda values: values.to(device), pixels))
+        return self.generator.latent_norm.normalise(self.generator.vae.encode(image).mean)
 
     def _result(
         self,
-        range_m: Tensor,
+        pixels: Pixels,
         latents: Tensor,
         nfe: int,
         vae_error_m: float | None = None,
         round_trip_m: float | None = None,
         cosine: Tensor | None = None,
     ) -> EditResult:
-        projection = self.generator.geometry.projection
         return EditResult(
-            range_m,
+            pixels.range_m,
             latents.cpu(),
             nfe,
-            projection,
+            self.generator.geometry.projection,
+            pixels.intensity,
+            None if pixels.classes is None else labels_of(pixels.classes),
             vae_error_m=vae_error_m,
             round_trip_m=round_trip_m,
             cosine=cosine,
@@ -368,62 +402,84 @@ class SceneEditor:
             interval=self.settings.window,
         )
 
-    def _draws(self, indices: Sequence[int], seed: int) -> Iterator[Tensor]:
-        """Noise after noise ``(B, C, h, w)`` for scenes, drawn on the CPU."""
-        return (
-            x.to(self.generator.device)
-            for x in scene_noise(self.generator.latent_shape, indices, seed)
-        )
-
-    def _each(
+    def _in_batches(
         self,
         indices: int | Sequence[int],
         seed: int,
         solve: Callable[[Tensor], tuple[Tensor, FeatureGuidance | None]],
     ) -> tuple[Tensor, Tensor | None]:
-        """Latents of scenes, made of their noise in batches, and their cosines if guided."""
-        numbers, size = scene_indices(indices), self.batch_size
+        """Latents that ``solve`` makes of the noise of each scene, and their cosines if guided."""
+        numbers, shape = scene_indices(indices), self.generator.latent_shape
         parts, cosines = [], []
-        for first in range(0, len(numbers), size):
-            made, guidance = solve(next(self._draws(numbers[first : first + size], seed)))
-            parts.append(made)
+        for first in range(0, len(numbers), self.batch_size):
+            batch = numbers[first : first + self.batch_size]
+            noise = next(scene_noise(shape, batch, seed)).to(self.generator.device)
+            latents, guidance = solve(noise)
+            parts.append(latents)
             if guidance is not None:
-                cosines.append(-guidance.energy(made, batch_time(0.0, made)).cpu())
+                cosines.append(-guidance.energy(latents, batch_time(0.0, latents)).cpu())
         return torch.cat(parts), torch.cat(cosines) if cosines else None
 
     def _decoded(
         self, latents: Tensor, indices: int | Sequence[int] | None = None, seed: int = 0
-    ) -> Tensor:
-        """Range images ``(B, H, W)`` on the CPU; numbered scenes lose single returns."""
-        numbers, size = None if indices is None else scene_indices(indices), self.batch_size
+    ) -> Pixels:
+        """Pixels ``(B, H, W)`` on the CPU; scenes with indices lose single returns."""
+        numbers = None if indices is None else scene_indices(indices)
         parts = []
-        for first in range(0, len(latents), size):
-            own = None if numbers is None else numbers[first : first + size]
-            parts.append(self.generator.decode(latents[first : first + size], own, seed).cpu())
-        return torch.cat(parts)
-
-    def _fitted(self, latents: Tensor, image: Tensor, known: Tensor) -> Tensor:
-        """Latents a few steps nearer to an image ``(C, H, W)`` where it is known."""
-        vae, norm = self.generator.vae, self.generator.latent_norm
-        with torch.enable_grad():
-            fitted = latents.detach().clone().requires_grad_()
-            adam = torch.optim.Adam([fitted], lr=_FIT_RATE, eps=_FIT_EPS)
-            for _ in range(_FIT_STEPS):
-                error = (vae.decode(norm.denormalise(fitted)) - image).square()
-                error = (error + _FIT_SMOOTH**2).sqrt() * known  # a plain norm has a kink at 0
-                (gradient,) = torch.autograd.grad(error.sum(), fitted)
-                length = gradient.square().mean(dim=(1, 2, 3), keepdim=True).sqrt()
-                fitted.grad = gradient / length.clamp(min=torch.finfo(length.dtype).tiny)
-                adam.step()
-        return fitted.detach()
+        for first in range(0, len(latents), self.batch_size):
+            batch = slice(first, first + self.batch_size)
+            batch_numbers = None if numbers is None else numbers[batch]
+            pixels = self.generator.decode_pixels(latents[batch], batch_numbers, seed)
+            parts.append(map_pixels(Tensor.cpu, pixels))
+        return _concatenate(parts)
 
     def _errors(
-        self, range_m: Tensor, latents: Tensor, trajectory: Trajectory | None
+        self, range_m: Tensor, latents: Tensor, trajectory: Trajectory | None = None
     ) -> tuple[float, float | None]:
         """Errors of the VAE, and of inversion and back, in metres."""
-        plain = self._decoded(latents)
-        error = range_error_m(plain, range_m)
+        reconstructed = self._decoded(latents).range_m
+        error = range_error_m(reconstructed, range_m)
         if trajectory is None:
             return error, None
         back = self._solve(self._sit.velocity, trajectory.states[0], trajectory.times)
-        return error, range_error_m(self._decoded(back), plain)
+        return error, range_error_m(self._decoded(back).range_m, reconstructed)
+
+
+def _batch_of(pixels: Pixels) -> Pixels:
+    return map_pixels(lambda values: values[None], pixels)
+
+
+def _concatenate(parts: Sequence[Pixels]) -> Pixels:
+    """Pixels of several batches; what one of them does not know is unknown."""
+    intensities = [part.intensity for part in parts if part.intensity is not None]
+    classes = [part.classes for part in parts if part.classes is not None]
+    return Pixels(
+        torch.cat([part.range_m for part in parts]),
+        torch.cat(intensities) if len(intensities) == len(parts) else None,
+        torch.cat(classes) if len(classes) == len(parts) else None,
+    )
+
+
+def _interpolated(pixels: Pixels, missing: Tensor) -> Pixels:
+    """Pixels with interpolated ranges, and with the nearest intensities and classes."""
+    range_m = interpolate_gaps(pixels.range_m, missing)
+    intensity, classes = (
+        None if values is None else interpolate_gaps(values.float(), missing, "nearest")
+        for values in (pixels.intensity, pixels.classes)
+    )
+    return Pixels(range_m, intensity, None if classes is None else classes.long())
+
+
+def _paste(decoded: Pixels, scan: Pixels, mask: Tensor) -> Pixels:
+    """Decoded pixels ``(B, H, W)`` inside a mask ``(H, W)``, those of the scan outside."""
+    range_m = torch.where(mask, decoded.range_m, scan.range_m)
+    intensity, classes = decoded.intensity, decoded.classes
+    if intensity is not None:
+        intensity = torch.where(range_m > 0, intensity, 0.0)
+        if scan.intensity is not None:
+            intensity = torch.where(mask, intensity, scan.intensity)
+    if classes is not None:
+        outside = torch.full_like(mask, UNKNOWN_CLASS, dtype=torch.long)
+        classes = torch.where(range_m > 0, classes, UNKNOWN_CLASS)
+        classes = torch.where(mask, classes, outside if scan.classes is None else scan.classes)
+    return Pixels(range_m, intensity, classes)

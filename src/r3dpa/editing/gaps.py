@@ -1,4 +1,4 @@
-"""Missing parts of a range image: checked against the field of view, or interpolated.
+"""Missing parts of a range image: found, checked against the field of view, interpolated.
 
 Letters: H beams, W columns, P points.
 """
@@ -10,17 +10,26 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from r3dpa.geometry.projection import Projection, in_range
-from r3dpa.geometry.sensor import EMPTY_RANGE_M, angles_of
+from r3dpa.geometry import EMPTY_RANGE_M, Pixels, Projection, in_range
+from r3dpa.geometry.sensor import angles_of
 
-Gaps = Literal["inverse", "linear", "nearest"]
-_LEAST_ROWS = 0.5  # of the field of view, that a scan of the same sensor fills
-_LEAST_COLUMNS = 0.75
-_LEAST_DENSE = 0.6  # of the returns have one right below: all beams 0.76 or more, half of them 0.52
-_MOST_OUTSIDE = 0.2  # share of points beyond the vertical field of view
-_MARGIN_DEG = 1.5  # that some lasers of a real sensor look further up or down than its limits
-_NEAR_ROWS = 4  # how far known beams tell of missing ones
+Interpolation = Literal["inverse", "linear", "nearest"]
+# Shares of the field of view that a scan of the same sensor fills.
+_LEAST_ROWS, _LEAST_COLUMNS = 0.5, 0.75
+# Share of the returns with one right below: 0.76 or more of all beams, 0.52 of half of them.
+_LEAST_DENSE = 0.6
+# Share of the points beyond the field of view, of scans of the same and of another sensor.
+_MOST_OUTSIDE, _MOST_OUTSIDE_OF_ANOTHER = 0.2, 0.6
+_MARGIN_DEG = 1.5  # some lasers of a real sensor look further up or down than its nominal limits
+_WIDEST_GAP_ROWS = 8  # between two beams of a sensor that has fewer
 _ONE_SURFACE = 1.3  # ratio of ranges up to which two beams are taken to meet one surface
+
+
+def in_view(points: Tensor, projection: Projection) -> Tensor:
+    """Whether points ``(P, 3)`` lie in the vertical field of view, up to 1.5 degrees beyond it."""
+    inclination = angles_of(points)[0].rad2deg()
+    lowest, highest = _view_deg(projection)
+    return (inclination >= lowest - _MARGIN_DEG) & (inclination <= highest + _MARGIN_DEG)
 
 
 def check_view(
@@ -28,7 +37,12 @@ def check_view(
 ) -> None:
     """Refuse a scan that does not fill the field of view that a model was trained on.
 
-    ``range_m`` ``(H, W)`` is the image of the points; pixels ``missing`` need not be filled.
+    Args:
+        points: ``(P, 3)`` metres.
+        range_m: ``(H, W)`` range image of the points.
+        projection: Projection of the model.
+        missing: ``(H, W)`` bool, pixels that need not be filled. The scan may then be of another
+            sensor, with three fifths of the points beyond the field of view.
 
     Raises:
         ValueError: If fewer than half of the rows or three quarters of the columns hold a return,
@@ -36,18 +50,19 @@ def check_view(
             beams, or more than a fifth of the points lie above or below the field of view.
     """
     sensor = projection.sensor
-    expected = torch.ones_like(range_m, dtype=torch.bool) if missing is None else ~missing
-    inclination = angles_of(points[in_range(points, sensor)])[0].rad2deg()
-    lowest, highest = (v.rad2deg().item() for v in projection.ray_angles()[0].aminmax())
-    outside = (inclination < lowest - _MARGIN_DEG) | (inclination > highest + _MARGIN_DEG)
-    if outside.double().mean() > _MOST_OUTSIDE:
+    lowest, highest = _view_deg(projection)
+    view = f"{lowest:.1f} to {highest:.1f} degrees above the horizon"
+    seen = points[in_range(points, sensor)]
+    outside = 1 - in_view(seen, projection).double().mean().item()
+    if outside > (_MOST_OUTSIDE if missing is None else _MOST_OUTSIDE_OF_ANOTHER):
+        inclination = angles_of(seen)[0].rad2deg()
         low, high = inclination.quantile(torch.tensor([0.01, 0.99]).double()).tolist()
         raise ValueError(
-            f"{outside.double().mean():.0%} of the points lie outside the field of view of the "
-            f"checkpoint, {lowest:.1f} to {highest:.1f} degrees above the horizon: those of the "
-            f"scan reach from {low:.1f} to {high:.1f}. It is of another sensor, or not in its "
-            "frame (x forward, z up, metres)"
+            f"{outside:.0%} of the points lie outside the field of view of the checkpoint, {view}: "
+            f"the scan reaches from {low:.1f} to {high:.1f}. It is of another sensor, or not in "
+            "its frame (x forward, z up, metres)"
         )
+    expected = torch.ones_like(range_m, dtype=torch.bool) if missing is None else ~missing
     returns = (range_m > 0) & expected
     for name, axis, least in (("beams", 1, _LEAST_ROWS), ("columns", 0, _LEAST_COLUMNS)):
         required = expected.any(dim=axis)
@@ -55,66 +70,96 @@ def check_view(
         if share < least:
             raise ValueError(
                 f"the scan fills {share:.0%} of the {int(required.sum())} {name} that the "
-                f"checkpoint was trained on ({sensor.beams} x {sensor.columns} pixels, "
-                f"{lowest:.1f} to {highest:.1f} degrees above the horizon): it is of another "
-                "sensor, a part of a scan, which `r3dpa edit complete` fills, or not in its own "
-                "frame"
+                f"checkpoint was trained on ({sensor.beams} x {sensor.columns} pixels, {view}): it "
+                "is of another sensor, a part of a scan, which `r3dpa edit complete` fills, or not "
+                "in its own frame"
             )
     above = returns[:-1] & expected[1:]
     dense = returns[1:][above].double().mean().item()
-    if dense < _LEAST_DENSE:  # not with NaN, where beams are missing between all others
+    # Where beams are missing between the others, hardly any pixel below a return is expected.
+    if above.sum() > returns.sum() / 2 and dense < _LEAST_DENSE:
         raise ValueError(
             f"only {dense:.0%} of the returns have another one right below them, not "
             f"{_LEAST_DENSE:.0%} or more as in scans of {sensor.beams} beams: it has fewer beams "
-            "than the checkpoint was trained on, or was thinned out"
+            "than the checkpoint was trained on, which `r3dpa edit complete --empty_beams` fills, "
+            "or was thinned out"
         )
 
 
-def filled(range_m: Tensor, missing: Tensor, how: Gaps = "inverse") -> Tensor:
-    """Range image ``(H, W)`` with interpolated gaps: between beams, else between columns.
+def interpolate_gaps(range_m: Tensor, missing: Tensor, how: Interpolation = "inverse") -> Tensor:
+    """Interpolate the missing pixels of a range image: between beams, else between columns.
 
     Args:
         range_m: ``(H, W)`` metres, -1 without a return.
-        missing: ``(H, W)`` bool; all other pixels stay as they are.
-        how: Between two returns ``inverse`` is linear in 1 / range, which is exact on planes up to
-            the curvature of the angles; ``linear`` is linear in range. Where one neighbour has no
-            return, and with ``nearest``, the nearest one, the upper or left one at a tie.
+        missing: ``(H, W)`` bool; all other pixels keep their values.
+        how: ``inverse`` is linear in 1 / range between two returns, which is exact on planes up to
+            the curvature of the angles; ``linear`` is linear in range. ``nearest`` copies the
+            nearest pixel, the upper or left one at a tie, as the others do where a neighbour has
+            no return.
     """
-    between, found = _neighbours(range_m.T, ~missing.T)
-    range_m = torch.where(missing & found.T, between.mean(how).T, range_m)
-    known = ~missing | found.T
-    width = range_m.shape[1]
-    between, _ = _neighbours(range_m.repeat(1, 3), known.repeat(1, 3))  # columns wrap around
-    return torch.where(known, range_m, between.mean(how)[:, width : 2 * width])
+    return torch.where(missing, _neighbours(range_m, missing, how).interpolate(how), range_m)
 
 
-def refined(made_m: Tensor, range_m: Tensor, missing: Tensor) -> Tensor:
-    """Generated ranges corrected by the known beams around them.
+def blend_completion(generated_m: Tensor, range_m: Tensor, missing: Tensor) -> Tensor:
+    """Fill missing pixels with what interpolation and a generated image are each better at.
 
-    Between two known beams on one surface the range is interpolated, between two without a return
-    there is none; elsewhere near a known beam the error at that beam is subtracted.
+    The generated image says where returns are. Their range is interpolated (``inverse``) where the
+    two known neighbours lie on one surface. At edges and in front of holes it is the mean of the
+    interpolated and the generated range, which is first limited to the ranges of the neighbours.
+    Either range stands alone where the other image has no return.
 
     Args:
-        made_m: ``(H, W)`` metres, generated; not above 0 without a return.
-        range_m: ``(H, W)`` metres, the scan.
-        missing: ``(H, W)`` bool, pixels that the scan lacks.
+        generated_m: ``(H, W)`` metres, not above 0 without a return.
+        range_m: ``(H, W)`` metres, the scan; not read where pixels are missing.
+        missing: ``(H, W)`` bool.
 
     Returns:
-        ``(H, W)``, -1 without a return; ``made_m`` far from known beams.
+        ``(H, W)``, -1 without a return; pixels that are not missing keep their values.
     """
-    made = made_m > 0
-    between, found = _neighbours(range_m.T, ~missing.T)
-    low, high = torch.minimum(*between[:2]), torch.maximum(*between[:2])
-    smooth = found & (low > 0) & (high < _ONE_SURFACE * low) & _near(~missing.T)
-    made &= ~(found & (high <= 0) & _near(~missing.T)).T
-    usable = ~missing & made & (range_m > 0)
-    error = torch.where(usable, range_m - made_m, 0.0)
-    errors, _ = _neighbours(error.T, usable.T)
-    moved = made_m + errors.first.lerp(errors.second, errors.share).T
-    # A correction must not carry a return behind the sensor.
-    moved = torch.where(_near(usable.T).T & (moved > 0), moved, made_m)
-    ranges = torch.where(smooth.T, between.mean("inverse").T, moved)
-    return torch.where(made, ranges, EMPTY_RANGE_M)
+    neighbours = _neighbours(range_m, missing, "inverse")
+    interpolated = neighbours.interpolate("inverse")
+    near = torch.minimum(neighbours.first, neighbours.second)
+    far = torch.maximum(neighbours.first, neighbours.second)
+    between_returns = near > 0
+    one_surface = between_returns & (far < _ONE_SURFACE * near)
+    limited = torch.where(between_returns, generated_m.clamp(near, far), generated_m)
+    blended = torch.where(between_returns, (interpolated + limited) / 2, interpolated)
+    filled = torch.where(one_surface, interpolated, blended)
+    filled = torch.where(interpolated > 0, filled, generated_m)
+    filled = torch.where(generated_m > 0, filled, EMPTY_RANGE_M)
+    return torch.where(missing, filled, range_m)
+
+
+def median_draw(draws: Pixels) -> Pixels:
+    """Pixels ``(H, W)`` with a return in at least half of the draws ``(K, H, W)``.
+
+    They have the range, intensity and class of the draw with the median range.
+    """
+    returns = draws.range_m > 0
+    median = torch.where(returns, draws.range_m, torch.nan).nanmedian(dim=0)
+    is_return = 2 * returns.sum(dim=0) >= len(returns)
+    range_m = torch.where(is_return, median.values, EMPTY_RANGE_M)
+    intensity, classes = (
+        None if values is None else values.gather(0, median.indices[None])[0]
+        for values in (draws.intensity, draws.classes)
+    )
+    return Pixels(range_m, intensity, classes)
+
+
+def unseen_pixels(range_m: Tensor) -> Tensor:
+    """Pixels ``(H, W)`` bool that the beams of a scan do not reach.
+
+    These are rows without a return, and empty pixels between two returns of their column that are
+    at most 8 rows apart, since the beams of another sensor need not lie in one row each.
+    """
+    returns = range_m > 0
+    row = torch.arange(len(range_m))[:, None].expand_as(range_m)
+    above = torch.where(returns, row, -_WIDEST_GAP_ROWS).cummax(dim=0).values
+    below = torch.where(returns, row, len(range_m) + _WIDEST_GAP_ROWS)
+    below = below.flip(0).cummin(dim=0).values.flip(0)
+    in_narrow_gap = below - above <= _WIDEST_GAP_ROWS
+    empty_row = ~returns.any(dim=1, keepdim=True)
+    return ~returns & (in_narrow_gap | empty_row)
 
 
 def range_error_m(first_m: Tensor, second_m: Tensor, pixels: Tensor | None = None) -> float:
@@ -128,14 +173,20 @@ def range_error_m(first_m: Tensor, second_m: Tensor, pixels: Tensor | None = Non
     return (first_m.double() - second_m.double()).abs()[both].mean().item()
 
 
+def _view_deg(projection: Projection) -> tuple[float, float]:
+    """Inclinations of the lowest and highest rays."""
+    lowest, highest = projection.ray_angles()[0].rad2deg().aminmax()
+    return lowest.item(), highest.item()
+
+
 class _Neighbours(NamedTuple):
-    """Nearest known values on both sides of a pixel and its position between them, in [0, 1]."""
+    """Nearest known values on both sides of a pixel, and its place between them, in [0, 1]."""
 
     first: Tensor
     second: Tensor
     share: Tensor
 
-    def mean(self, how: Gaps) -> Tensor:
+    def interpolate(self, how: Interpolation) -> Tensor:
         nearest = torch.where(self.share <= 0.5, self.first, self.second)
         if how == "nearest":
             return nearest
@@ -144,23 +195,31 @@ class _Neighbours(NamedTuple):
         return torch.where((self.first > 0) & (self.second > 0), mean, nearest)
 
 
-def _neighbours(values: Tensor, known: Tensor) -> tuple[_Neighbours, Tensor]:
-    """Known neighbours along the last axis (at an end the same one twice), and where any exists."""
+def _neighbours(range_m: Tensor, missing: Tensor, how: Interpolation) -> _Neighbours:
+    """Known neighbours above and below, or left and right where the column has none.
+
+    Columns wrap around. Neighbours to the left and right may be interpolated ones.
+    """
+    vertical, has_known = _neighbours_along_rows(range_m.T, ~missing.T)
+    has_known = has_known.T
+    vertical = _Neighbours(*(values.T for values in vertical))
+    range_m = torch.where(missing & has_known, vertical.interpolate(how), range_m)
+    width = range_m.shape[1]
+    known = (~missing | has_known).repeat(1, 3)
+    horizontal, _ = _neighbours_along_rows(range_m.repeat(1, 3), known)
+    middle = slice(width, 2 * width)
+    pairs = zip(vertical, horizontal, strict=True)
+    return _Neighbours(*(torch.where(has_known, up, side[:, middle]) for up, side in pairs))
+
+
+def _neighbours_along_rows(values: Tensor, known: Tensor) -> tuple[_Neighbours, Tensor]:
+    """Known neighbours along the last axis, at an end one twice, and where there is any."""
     length = values.shape[-1]
     place = torch.arange(length).expand(values.shape)
     before = torch.where(known, place, -1).cummax(dim=-1).values
     after = torch.where(known, place, length).flip(-1).cummin(dim=-1).values.flip(-1)
-    found = (before >= 0) | (after < length)
+    has_known = (before >= 0) | (after < length)
     before = torch.where(before >= 0, before, after).clamp(max=length - 1)
     after = torch.where(after < length, after, before)
     share = ((place - before).to(values) / (after - before).clamp(min=1)).clamp(0, 1)
-    return _Neighbours(values.gather(-1, before), values.gather(-1, after), share), found
-
-
-def _near(known: Tensor) -> Tensor:
-    """Pixels within ``_NEAR_ROWS`` of a known one along the last axis."""
-    near = known.clone()
-    for step in range(1, _NEAR_ROWS + 1):
-        near[..., step:] |= known[..., :-step]
-        near[..., :-step] |= known[..., step:]
-    return near
+    return _Neighbours(values.gather(-1, before), values.gather(-1, after), share), has_known

@@ -1,10 +1,10 @@
-"""Editing of given latents: inversion to noise, inpainting that keeps the surroundings.
+"""Editing of given latents: inversion to noise, inpainting that preserves the surroundings.
 
-The kept latents are put back after every step of a solver::
+The latents outside the mask are restored after every step of a solver::
 
     trajectory = invert(sit.velocity, latents, ode_times(50), "midpoint")
-    start = renoised(trajectory, edit_mask, noise)
-    solve = ode_solver("midpoint", after_step=kept(trajectory, edit_mask))
+    start = noise_inside_mask(trajectory, edit_mask, noise)
+    solve = ode_solver("midpoint", after_step=restore_outside_mask(trajectory, edit_mask))
     edited = solve(guidance, start, trajectory.times)
 
 Letters: B batch, C latent channels, h x w latent size, T times, ``...`` axes of the latents.
@@ -66,10 +66,10 @@ def invert(
     return Trajectory(times, torch.stack(states[::-1]))
 
 
-def renoised(
+def noise_inside_mask(
     trajectory: Trajectory, edit_mask: Tensor, noise: Tensor, interpolant: Interpolant = LINEAR
 ) -> Tensor:
-    """Start of an edit: fresh noise inside the mask, the inverted latents elsewhere.
+    """Return the start of an edit: fresh noise inside the mask, inverted latents elsewhere.
 
     Where the trajectory starts at a time t below 1, the edit starts from the noisy latents of that
     time, ``alpha(t) data + sigma(t) noise``.
@@ -90,63 +90,64 @@ def renoised(
     return torch.where(edit_mask, fresh, inverted)
 
 
-def kept(trajectory: Trajectory, edit_mask: Tensor) -> AfterStep:
-    """Hook of a solver that puts the given latents back outside the mask after every step.
+def restore_outside_mask(trajectory: Trajectory, edit_mask: Tensor) -> AfterStep:
+    """Return a solver hook that restores the given latents outside the mask after every step.
 
-    Outside, the state equals the trajectory at every time of the grid; at the last time it is the
-    given latents bit by bit. Stages between two times (midpoint, Heun) see a state that is a step
-    further on outside. The velocities that multistep solvers keep belong to the states put back, so
-    outside their history is that of the trajectory, and corrections of an earlier step are
-    overwritten too.
+    Outside the mask, the state equals the trajectory at every time of the grid, and the given
+    latents bit for bit at the last time. Stages between two times (midpoint, Heun) see a state that
+    is one step further outside the mask. Multistep solvers remember the velocities of restored
+    states, and their corrections of an earlier step are overwritten as well.
 
     Args:
-        trajectory: Of the latents to keep, on the grid of the solver: another is a ``ValueError``.
+        trajectory: Trajectory of the latents to restore, on the time grid of the solver.
         edit_mask: Bool, True where latents are generated anew; broadcasts to ``(B, ...)``.
+
+    Raises:
+        ValueError: If the mask does not fit, or, in a step, the solver runs on another time grid.
     """
     _check_mask(edit_mask, trajectory.states[0])
     times = trajectory.times.tolist()
 
-    def put_back(x: Tensor, time: float, index: int) -> Tensor:
-        if times[index : index + 1] != [time]:
+    def restore(x: Tensor, time: float, index: int) -> Tensor:
+        if index >= len(times) or times[index] != time:
             raise ValueError(
-                f"step {index} of the solver ends at t = {time}, but the kept latents were "
-                f"inverted on {times}; use one grid for both"
+                f"step {index} of the solver ends at t = {time}, but the latents were inverted on "
+                f"{times}; use one time grid for both"
             )
         return torch.where(edit_mask, x, trajectory.states[index].to(x.dtype))
 
-    return put_back
+    return restore
 
 
-def spherical_mean(first: Tensor, second: Tensor, share: float) -> Tensor:
-    """Point on the arc between two noises, whose length stays that of noise.
+def slerp(first: Tensor, second: Tensor, share: float) -> Tensor:
+    """Interpolate two noises on the arc between them, which preserves their length.
 
-    Formula, per sample with the angle a between them:
-    ``(sin((1 - s) a) first + sin(s a) second) / sin(a)``.
+    Per sample, with the angle a between the noises::
+
+        (sin((1 - s) a) first + sin(s a) second) / sin(a)
+
+    Parallel and opposite noises are interpolated linearly.
 
     Source: Shoemake 1985; for noises of diffusion models DDIM (Song et al. 2021), app. D.5.
 
     Args:
-        first: ``(B, ...)`` at share 0.
-        second: ``(B, ...)`` at share 1.
-        share: In [0, 1].
-
-    For parallel or opposite noises it is the straight mean.
+        first: ``(B, ...)``, returned at share 0.
+        second: ``(B, ...)``, returned at share 1.
+        share: Position s on the arc, in [0, 1].
     """
     if first.shape != second.shape or not 0 <= share <= 1:
         raise ValueError(
-            "a mean of two noises needs one shape and a share in [0, 1], got "
+            "slerp needs two noises of one shape and a share in [0, 1], got "
             f"{tuple(first.shape)}, {tuple(second.shape)} and {share}"
         )
-    flat = first.flatten(1).double(), second.flatten(1).double()
-    angle = torch.cosine_similarity(*flat, dim=1).clamp(-1, 1).acos()
-    arc = angle.sin()
-    straight = arc < 1e-6  # the formula would divide 0 by 0
-    weights = [
-        torch.where(straight, part, (part * angle).sin() / torch.where(straight, 1.0, arc))
-        for part in (1 - share, share)
-    ]
-    mean = sum(weight[:, None] * noise for weight, noise in zip(weights, flat, strict=True))
-    return torch.as_tensor(mean).reshape(first.shape).to(first.dtype)
+    flat_first, flat_second = first.flatten(1).double(), second.flatten(1).double()
+    angle = torch.cosine_similarity(flat_first, flat_second, dim=1).clamp(-1, 1).acos()
+    linear = angle.sin() < 1e-6  # the formula would divide 0 by 0
+    divisor = torch.where(linear, 1.0, angle.sin())
+    first_weight = torch.where(linear, 1 - share, ((1 - share) * angle).sin() / divisor)
+    second_weight = torch.where(linear, share, (share * angle).sin() / divisor)
+    mean = first_weight[:, None] * flat_first + second_weight[:, None] * flat_second
+    return mean.reshape(first.shape).to(first.dtype)
 
 
 @torch.no_grad()
@@ -163,7 +164,7 @@ def pnp_flow_feature(
     """Inpaint latents towards given features, plug-and-play with the flow as denoiser.
 
     Starts from zero. At every time, with step ``t^exponent``: a step along the feature term, a
-    step that pulls the kept region to the given latents, fresh noise to reach time t, and the
+    step that pulls the surroundings to the given latents, fresh noise to reach time t, and the
     expected data on the linear path::
 
         x <- x - t^a feature_term(x, t)

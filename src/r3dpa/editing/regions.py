@@ -3,7 +3,7 @@
 Angles are in degrees: azimuth 0 looks forward and grows to the left (counter-clockwise seen from
 above), so that 180 and -180 look backwards, where the range image has its seam; inclination grows
 upwards from the horizon. A pixel stands for the ray through its centre. A mask that selects no
-pixel, or all of them, raises a ValueError that says why.
+pixel, or all of them, raises a ValueError with the reason.
 Letters: H beams, W columns, h x w cells, N = h * w tokens, S sources.
 """
 
@@ -34,8 +34,8 @@ def angle_box(
     """Pixels ``(H, W)`` bool between two azimuths in -360..360 and two inclinations.
 
     Azimuths run leftwards from the first to the second: ``170, -170`` are the 20 degrees across
-    the seam behind the sensor, ``-10, 10`` the 20 degrees ahead. The first border of each pair
-    belongs to the box, the second does not.
+    the seam behind the sensor, ``-10, 10`` the 20 degrees ahead. The box includes the first border
+    of each pair and excludes the second.
     """
     what = (
         f"box of azimuth {azimuth_from_deg:g}..{azimuth_to_deg:g} and inclination "
@@ -47,7 +47,7 @@ def angle_box(
     inclination, _ = _rays_deg(projection)
     rows = (inclination >= inclination_min_deg) & (inclination < inclination_max_deg)
     if not rows.any():
-        raise _missed(projection, what)
+        raise _no_ray_error(projection, what)
     return check_mask(rows[:, None] & columns, what)
 
 
@@ -61,7 +61,7 @@ def sector(projection: Projection, azimuth_from_deg: float, azimuth_to_deg: floa
 def box3d(
     projection: Projection, centre_m: Sequence[float], size_m: Sequence[float], yaw_deg: float = 0.0
 ) -> Tensor:
-    """Pixels whose ray meets a box within the range limits, and thus what occludes it, too.
+    """Pixels whose ray meets a box within the range limits, whatever occludes the box.
 
     Slab test per ray ``t * d`` from the sensor, with the box's centre c and half size s in the
     axes of the box: the ray is inside for ``max_i min(t_i) <= t <= min_i max(t_i)``, where
@@ -102,12 +102,12 @@ def box3d(
     end = torch.maximum(low, high).amin(dim=-1)
     met = (entry <= end) & (entry < sensor.range_max_m) & (end > sensor.range_min_m)
     if not met.any():
-        raise _missed(projection, what)
+        raise _no_ray_error(projection, what)
     return check_mask(met, what)
 
 
 def dropped_beams(projection: Projection, kept: Sequence[int]) -> Tensor:
-    """Pixels ``(H, W)`` bool of the beams that a scan with only the rows ``kept`` lacks."""
+    """Pixels ``(H, W)`` bool of all rows but those of ``kept``."""
     beams = projection.sensor.beams
     missing = torch.ones(beams, projection.sensor.columns, dtype=torch.bool)
     missing[list(kept)] = False
@@ -138,13 +138,13 @@ def sensor_pair(projection: Projection, other: Projection) -> Tensor:
 
 
 def check_mask(mask: Tensor, what: str) -> Tensor:
-    """The mask itself; a ValueError that starts with ``what`` if it selects nothing or all."""
+    """Return the mask; raise a ValueError that names ``what`` if it selects nothing or all."""
     if not mask.any():
         raise ValueError(f"{what}: selects nothing, so that nothing would change; make it larger")
     if mask.all():
         raise ValueError(
             f"{what}: selects all of {' x '.join(map(str, mask.shape))}, so that nothing of the "
-            "scan would be kept; make it smaller, or draw a new scene"
+            "scan would stay; make it smaller, or generate a new scene"
         )
     return mask
 
@@ -166,7 +166,7 @@ def token_mask(pixel_mask: Tensor, grid_size: tuple[int, int], dilation: int = 0
 
 
 def mask_of_tokens(tokens: Tensor, grid_size: tuple[int, int], size: tuple[int, int]) -> Tensor:
-    """Token values ``(..., N)`` of a grid ``(h, w)`` repeated over the patches of an image.
+    """Repeat token values ``(..., N)`` of a grid ``(h, w)`` over the patches of an image.
 
     Args:
         tokens: ``(..., N)``, bool or weights.
@@ -179,7 +179,7 @@ def mask_of_tokens(tokens: Tensor, grid_size: tuple[int, int], size: tuple[int, 
 
 
 def dilated(mask: Tensor, steps: int) -> Tensor:
-    """Mask ``(..., rows, columns)`` dilated ``steps`` times by its 8 neighbours; columns wrap."""
+    """Dilate a mask ``(..., rows, columns)`` by its 8 neighbours ``steps`` times; columns wrap."""
     if steps < 0:
         raise ValueError(f"dilation must be 0 or greater, got {steps}")
     for _ in range(steps):
@@ -235,7 +235,7 @@ def sector_weights(
 
 
 def _covered(place: Tensor, width: float) -> Tensor:
-    """Length of a sector ``[0, width]``, repeated every turn, between 0 and a place; degrees."""
+    """Degrees between 0 and a place that lie in a sector ``[0, width]`` of every turn."""
     return (place / _TURN_DEG).floor() * width + (place % _TURN_DEG).clamp(max=width)
 
 
@@ -253,8 +253,8 @@ def _between(projection: Projection, from_deg: float, to_deg: float, what: str) 
     return columns
 
 
-def _missed(projection: Projection, what: str) -> ValueError:
-    """Error that no ray meets a region, with what the rays reach."""
+def _no_ray_error(projection: Projection, what: str) -> ValueError:
+    """Error of a region that no ray meets, with the reach of the rays."""
     bottom, top = _rays_deg(projection)[0].aminmax()
     sensor = projection.sensor
     return ValueError(
@@ -270,7 +270,7 @@ def _rays_deg(projection: Projection) -> tuple[Tensor, Tensor]:
 
 
 def _nearest(apart_deg: Tensor) -> Tensor:
-    """Index of the smallest angle in each row; the first of those equal up to rounding."""
+    """Index of the smallest angle in each row, the first of several equal up to rounding."""
     return apart_deg.abs().round(decimals=_DECIMALS).argmin(dim=1)
 
 

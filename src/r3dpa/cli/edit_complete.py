@@ -1,0 +1,303 @@
+"""Completion of scans from files: generated points after those of the scan, and errors."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+from tqdm import tqdm
+
+from lidarsim import WeatheredScan
+from lidarsim.clouds import ScanFile, find_files, read_file, write_file
+from r3dpa.cli.edit_session import EditSession, ScanView
+from r3dpa.cli.parser import EditOptions
+from r3dpa.data.scene_writer import SceneWriter
+from r3dpa.editing import EditResult
+from r3dpa.editing.gaps import interpolate_gaps, range_error_m, unseen_pixels
+from r3dpa.editing.regions import check_mask, dropped_beams, sector, sensor_pair
+from r3dpa.geometry import Projection, SphericalProjection, points_of, values_at_returns
+from r3dpa.io import in_processes
+
+_SCANS = "scans"  # folder of the completed scans
+_METHODS = ("completed", "linear", "nearest")
+# notebooks/results/completion.json
+_BENCHMARK = (
+    "no return was held out; on 30 real scans without every 2nd beam the mean error of completions "
+    "is 0.38 m, of linear interpolation 0.40 m, of the nearest beam 0.60 m"
+)
+
+
+@dataclass(frozen=True)
+class MissingPixels:
+    """Which pixels of a scan are missing; see the options of ``r3dpa edit complete``."""
+
+    sector: tuple[float, float] | None = None
+    keep_every: int | None = None
+    empty_beams: bool = False
+    other_sensor: tuple[int, float, float] | None = None
+    mask: Path | None = None
+
+    def find(self, range_m: Tensor, session: EditSession) -> Tensor:
+        """Mask ``(H, W)`` of all that is missing in a range image."""
+        projection, sensor = session.projection, session.sensor
+        masks = []
+        if self.sector is not None:
+            masks.append(sector(projection, *self.sector))
+        if self.keep_every is not None:
+            if not 2 <= self.keep_every <= sensor.beams // 2:
+                raise ValueError(
+                    f"--keep_every must be 2 to {sensor.beams // 2}, got {self.keep_every}"
+                )
+            rows = range(0, sensor.beams, self.keep_every)
+            masks.append(dropped_beams(projection, rows))
+        if self.other_sensor is not None:
+            beams, lowest, highest = self.other_sensor
+            other = replace(
+                sensor, beams=beams, inclination_min_deg=lowest, inclination_max_deg=highest
+            )
+            masks.append(sensor_pair(projection, SphericalProjection(other)))
+        if self.mask is not None:
+            masks.append(session.read_mask(self.mask))
+        if self.empty_beams:
+            masks.append(unseen_pixels(range_m))
+        return check_mask(torch.stack(masks).any(dim=0), "all that is missing")
+
+
+class Completion(NamedTuple):
+    """Result of a worker: NumPy arrays travel between processes as they are."""
+
+    number: int
+    range_m: np.ndarray
+    intensity: np.ndarray | None
+    nfe: int
+
+
+@dataclass(frozen=True)
+class CompletionJob:
+    """A call completes one file, writes the results and returns their images.
+
+    Args:
+        root: Folder that names of results are relative to.
+        options: Those of the edit.
+        missing: What is missing.
+        num: Results per scan.
+        start: Time of the noise; default: that of the editor.
+        resamplings: Of RePaint.
+        threads: Of torch in each process; None leaves them as they are.
+    """
+
+    root: Path
+    options: EditOptions
+    missing: MissingPixels
+    num: int
+    start: float | None
+    resamplings: int | None
+    threads: int | None
+
+    def read(self, path: Path) -> tuple[ScanFile, ScanView, Tensor]:
+        """A file, its view, and the mask of what is missing."""
+        session, file = _session(self.options, self.num), read_file(path)
+        view = session.view(path, file.scan, only_in_view=True)
+        missing = self.missing.find(view.range_m, session)
+        session.check(view, missing)
+        return file, view, missing
+
+    def __call__(self, task: tuple[int, Path]) -> Completion:
+        """Complete the scan of a number and file."""
+        if self.threads is not None:
+            torch.set_num_threads(self.threads)
+        number, path = task
+        session = _session(self.options, self.num)
+        file, view, missing = self.read(path)
+        if session.baseline is not None:
+            result = session.complete(view, missing, self.resamplings or 10)
+        else:
+            start = {} if self.start is None else {"start": self.start}
+            result = session.editor.complete(
+                view.pixels, missing, self.num, self.options.seed, **start
+            )
+        for index in range(self.num):
+            completed = _completed_file(file, result, index, missing)
+            folder = self.options.out / _SCANS
+            write_file(completed, self.root, folder / str(index) if self.num > 1 else folder)
+        intensity = None if result.intensity is None else result.intensity.numpy()
+        return Completion(number, result.range_m.numpy(), intensity, result.nfe)
+
+
+@lru_cache(maxsize=1)
+def _session(options: EditOptions, num: int) -> EditSession:
+    return EditSession(options, num)
+
+
+def complete_files(
+    source: Path,
+    options: EditOptions,
+    missing: MissingPixels,
+    arguments: dict[str, Any],
+    num: int,
+    start: float | None,
+    resamplings: int | None,
+    workers: int,
+) -> str:
+    """Complete a scan or all scans of a folder; return a summary with errors."""
+    root, paths = find_files(source)
+    session = _session(options, num)
+    stage = session.checkpoint.stage
+    if start is not None and session.baseline is not None:
+        raise ValueError(f"--start is for R3DPA: stage {stage} starts from noise")
+    if resamplings is not None and stage not in ("r2dm", "r2flow"):
+        raise ValueError(f"--resamplings is for R2DM and R2Flow, not for stage {stage}")
+    threads = None if workers == 1 else max(1, (os.cpu_count() or 1) // workers)
+    job = CompletionJob(root, options, missing, num, start, resamplings, threads)
+    _, first_view, first_missing = job.read(paths[0])  # a bad request fails before the first file
+    names = [path.relative_to(root).as_posix() for path in paths]
+    request = session.request("complete", arguments, {"scans": names})
+    request |= {"num": len(paths) * num, "num_per_scan": num}
+    with SceneWriter(
+        options.out, request["num"], session.projection, (), request, options.overwrite
+    ) as writer:
+        tasks = list(enumerate(paths))[writer.num_done // num :]
+        for completion in _in_order(job, tasks, workers, len(paths)):
+            intensity = completion.intensity
+            writer.put(
+                torch.from_numpy(completion.range_m),
+                completion.nfe,
+                None if intensity is None else torch.from_numpy(intensity),
+            )
+        writer.close()
+        images = np.load(writer.range_path, mmap_mode="r").reshape(len(paths), num, *_size(session))
+        errors = {}
+        for name, path, image in zip(names, paths, images, strict=True):
+            _, view, gaps = job.read(path)
+            errors[name] = held_out_errors(torch.from_numpy(image.copy()), view.range_m, gaps)
+        known = first_view._replace(range_m=torch.where(first_missing, -1.0, first_view.range_m))
+        shown = {f"scan {paths[0].stem}": first_view, "known part": known}
+        first_images = torch.from_numpy(images[0].copy())
+        session.show("complete", shown, first_images, first_missing, ("kept", "missing"))
+        mean = _mean_errors(list(errors.values()))
+        nfe = writer.evaluations // writer.num
+        writer.finish(request | {"nfe": nfe, "held_out": mean, "held_out_by_scan": errors})
+    return _summary(len(paths), nfe, mean, options.out)
+
+
+def _in_order(
+    job: CompletionJob, tasks: Sequence[tuple[int, Path]], workers: int, total: int
+) -> Iterator[Completion]:
+    """Completions in the order of the scans, whichever worker is ready first."""
+    waiting: dict[int, Completion] = {}
+    following = iter([number for number, _ in tasks])
+    expected = next(following, None)
+    with tqdm(total=total, initial=total - len(tasks), unit="scan", disable=None) as bar:
+        for completion in in_processes(job, tasks, workers):
+            waiting[completion.number] = completion
+            bar.update()
+            while expected in waiting:
+                yield waiting.pop(expected)
+                expected = next(following, None)
+
+
+def _completed_file(file: ScanFile, result: EditResult, index: int, missing: Tensor) -> ScanFile:
+    """The file with all its points, and generated ones where the scan has no point.
+
+    Intensity and further columns of generated points are those of the nearest point of the scan, if
+    the model has no intensity; labels are those of the model, else 0.
+    """
+    scan, projection = file.scan, result.projection
+    filled = missing & ~_occupied(torch.from_numpy(scan.points), projection)
+    range_m = torch.where(filled, result.range_m[index], -1.0)
+    added = points_of(range_m, projection).numpy()
+    nearest = cKDTree(scan.points).query(added)[1].astype(np.int64)
+    intensity, labels = scan.intensity, scan.labels
+    if intensity is not None:
+        new = intensity[nearest]
+        if result.intensity is not None:
+            image = result.intensity[index]
+            new = values_at_returns(image, range_m, projection).numpy().astype(intensity.dtype)
+        intensity = np.concatenate([intensity, new])
+    if labels is not None:
+        new_labels = np.zeros(len(added), labels.dtype)
+        if result.labels is not None:
+            image = result.labels[index]
+            new_labels = values_at_returns(image, range_m, projection).numpy().astype(labels.dtype)
+        labels = np.concatenate([labels, new_labels])
+    own = np.arange(len(scan))
+    completed = WeatheredScan(
+        points=np.concatenate([scan.points, added]),
+        intensity=intensity,
+        labels=labels,
+        index=np.concatenate([own, np.full(len(added), -1)]),
+        shot=np.concatenate([own, nearest]),
+        origins=np.zeros(len(scan) + len(added), np.uint8),
+        effects=(),
+        report={},
+    )
+    return file.changed(completed)
+
+
+def _occupied(points: Tensor, projection: Projection) -> Tensor:
+    """Pixels ``(H, W)`` bool with a point of the scan, beyond the range limits too."""
+    sensor = projection.sensor
+    occupied = torch.zeros(sensor.beams, sensor.columns, dtype=torch.bool)
+    occupied[projection.pixel_of(points)] = True
+    return occupied
+
+
+def held_out_errors(made: Tensor, range_m: Tensor, missing: Tensor) -> dict[str, Any]:
+    """Errors of completions ``(B, H, W)`` on the returns of the scan, beside interpolations.
+
+    Ranges are compared where the scan and all methods have a return; empty without any there.
+    """
+    if not ((range_m > 0) & missing).any():
+        return {}
+    images = {"completed": made}
+    for how in ("linear", "nearest"):
+        images[how] = interpolate_gaps(range_m, missing, how)[None]
+    common = missing & (torch.cat(list(images.values())) > 0).all(dim=0)
+    return {
+        name: {
+            "mae_m": range_error_m(image, range_m.expand_as(image), common),
+            "same_returns": ((image > 0) == (range_m > 0))[:, missing].double().mean().item(),
+        }
+        for name, image in images.items()
+    }
+
+
+def _mean_errors(errors: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Mean over the scans with held-out returns, empty if there are none."""
+    measured = [error for error in errors if error]
+    if not measured:
+        return {}
+    return {
+        method: {
+            key: float(np.nanmean([error[method][key] for error in measured]))
+            for key in measured[0][method]
+        }
+        for method in _METHODS
+    }
+
+
+def _summary(num_scans: int, nfe: int, errors: dict[str, Any], out: Path) -> str:
+    text = _BENCHMARK
+    if errors:
+        completed, linear, nearest = (errors[method]["mae_m"] for method in _METHODS)
+        text = (
+            f"mean error of the held-out returns: completed {completed:.2f} m, linear "
+            f"interpolation {linear:.2f} m, nearest beam or column {nearest:.2f} m"
+        )
+    return (
+        f"complete: {num_scans} scans in {out / _SCANS}, {nfe} network evaluations each; all their "
+        f"points, then the generated ones\n{text}\n"
+        f"open {out / 'edit.png'} and {out / 'edit.html'}"
+    )
+
+
+def _size(session: EditSession) -> tuple[int, int]:
+    return session.sensor.beams, session.sensor.columns

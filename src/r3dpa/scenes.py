@@ -1,0 +1,307 @@
+"""Scans that go into the networks, and scenes that come out.
+
+Scans are given as NumPy arrays, tensors, files or objects with points; scenes hold tensors.
+Letters: B scenes, H beams, W columns, C latent channels, h x w latent size, P points.
+"""
+
+from __future__ import annotations
+
+import html
+import io
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, Self, overload
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from r3dpa.geometry import (
+    SEMANTIC_CLASSES,
+    Pixels,
+    Projection,
+    classes_of,
+    in_range,
+    labels_of,
+    points_of,
+    project_pixels,
+    values_at_returns,
+)
+
+_PICTURES, _PAGES = 4, 8  # scenes that a notebook cell shows
+
+ScanLike = Any
+"""A scan: points ``(P, 3)``, or ``(P, 4)`` with the intensity; a range image ``(H, W)`` in metres;
+both as tensors or NumPy arrays; the file of a scan; a :class:`Scene` or
+:class:`r3dpa.geometry.Pixels`; or an object with ``points`` and perhaps ``intensity`` and
+``labels``, such as a simulated or recorded scan."""
+
+
+def scan_pixels(scan: ScanLike, projection: Projection) -> Pixels:
+    """Pixels ``(H, W)`` of a scan, on the CPU.
+
+    Args:
+        scan: See :data:`ScanLike`.
+        projection: Which pixel a point belongs to.
+
+    Raises:
+        ValueError: If the scan is of another shape, has a value that is not finite, or has no point
+            within the range limits.
+    """
+    if isinstance(scan, Scene):
+        classes = None if scan.labels is None else classes_of(scan.labels.cpu())
+        scan = Pixels(scan.range_m, scan.intensity, classes)
+    if isinstance(scan, Pixels):
+        return map_pixels(torch.Tensor.cpu, scan)
+    labels = None
+    if isinstance(scan, str | Path):
+        from lidarsim.clouds import read_file
+
+        scan = read_file(Path(scan)).scan
+    if hasattr(scan, "points"):
+        labels = getattr(scan, "labels", None)
+        intensity = getattr(scan, "intensity", None)
+        scan = scan.points
+        if intensity is not None:
+            scan = np.column_stack([scan, np.asarray(intensity, dtype=np.float32)])
+    values = torch.as_tensor(scan).detach().cpu().float()
+    sensor = projection.sensor
+    if not values.isfinite().all():
+        raise ValueError("the scan has NaN or infinite values; leave these points out")
+    if values.shape == (sensor.beams, sensor.columns):
+        return Pixels(values)
+    if values.ndim != 2 or values.shape[1] not in (3, 4):
+        raise ValueError(
+            f"a scan must be points (P, 3) or (P, 4), or a range image ({sensor.beams}, "
+            f"{sensor.columns}), got shape {tuple(values.shape)}"
+        )
+    if not in_range(values[:, :3], sensor).any():
+        raise ValueError(
+            f"the scan has no point within {sensor.range_min_m:g}..{sensor.range_max_m:g} m; "
+            "coordinates must be metres"
+        )
+    if labels is not None:
+        labels = torch.from_numpy(np.asarray(labels, dtype=np.int64))
+    return project_pixels(values, projection, labels)
+
+
+def map_pixels(function: Callable[[Tensor], Tensor], pixels: Pixels) -> Pixels:
+    """Apply a function to each known part of pixels."""
+    further = (None if values is None else function(values) for values in pixels[1:])
+    return Pixels(function(pixels.range_m), *further)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Scene:
+    """One scene.
+
+    Attributes:
+        range_m: ``(H, W)`` metres, -1 without a return.
+        projection: Maps pixels to points.
+        intensity: ``(H, W)`` in [0, 1], or None.
+        labels: ``(H, W)`` int64 class ids of KITTI-360, 0 without a return, or None.
+    """
+
+    range_m: Tensor
+    projection: Projection
+    intensity: Tensor | None = None
+    labels: Tensor | None = None
+
+    def __repr__(self) -> str:
+        num_points = int((self.range_m > 0).sum())
+        return f"Scene({num_points} points, {_describe(self.range_m, self.intensity, self.labels)})"
+
+    @property
+    def points(self) -> Tensor:
+        """Points ``(P, 3)`` in metres, x forward, y left, z up, on the CPU."""
+        return points_of(self.range_m.cpu(), self.projection)
+
+    @property
+    def point_intensity(self) -> Tensor:
+        """Intensity ``(P,)`` of the points, on the CPU; ValueError if the scene has none."""
+        return self._at_points("intensity", self.intensity)
+
+    @property
+    def point_labels(self) -> Tensor:
+        """Class ids of KITTI-360 ``(P,)`` of the points, on the CPU; ValueError if there are none.
+
+        Names are in :data:`r3dpa.geometry.SEMANTIC_CLASSES`.
+        """
+        return self._at_points("labels", self.labels)
+
+    def _at_points(self, name: str, values: Tensor | None) -> Tensor:
+        if values is None:
+            raise ValueError(
+                f"these scenes have no {name}: their checkpoint was trained on range images without"
+            )
+        return values_at_returns(values.cpu(), self.range_m.cpu(), self.projection)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class SceneBatch:
+    """Generated scenes, on the device of the networks.
+
+    ``batch[i]`` and iteration give a :class:`Scene`, ``batch[1:3]`` a batch of some.
+
+    Attributes:
+        range_m: ``(B, H, W)`` float32 metres; -1 without a return, NaN for a whole scene if the
+            networks returned anything non-finite for it.
+        latents: ``(B, C, h, w)`` normalised latents.
+        nfe: Network evaluations per scene.
+        projection: Maps pixels to points.
+        intensity: ``(B, H, W)`` in [0, 1], of networks that generate it.
+        labels: ``(B, H, W)`` int64 class ids of KITTI-360, 0 without a return, likewise.
+    """
+
+    range_m: Tensor
+    latents: Tensor
+    nfe: int
+    projection: Projection
+    intensity: Tensor | None = None
+    labels: Tensor | None = None
+
+    @classmethod
+    def of(cls, pixels: Pixels, latents: Tensor, nfe: int, projection: Projection) -> Self:
+        """Scenes of decoded pixels ``(B, H, W)``."""
+        labels = None if pixels.classes is None else labels_of(pixels.classes)
+        return cls(pixels.range_m, latents, nfe, projection, pixels.intensity, labels)
+
+    def __repr__(self) -> str:
+        about = _describe(self.range_m, self.intensity, self.labels)
+        return f"{type(self).__name__}({len(self)} scenes, {about}, {self.nfe} evaluations each)"
+
+    def __len__(self) -> int:
+        """Number of scenes B."""
+        return len(self.range_m)
+
+    @overload
+    def __getitem__(self, index: int) -> Scene: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> Self: ...
+
+    def __getitem__(self, index: int | slice) -> Scene | Self:
+        """One scene, or a batch of some."""
+        if isinstance(index, slice):
+            values = {field.name: getattr(self, field.name) for field in fields(self)}
+            parts: dict[str, Any] = {
+                name: value[index] for name, value in values.items() if isinstance(value, Tensor)
+            }
+            return replace(self, **parts)
+        intensity, labels = (
+            None if values is None else values[index] for values in (self.intensity, self.labels)
+        )
+        return Scene(self.range_m[index], self.projection, intensity, labels)
+
+    def __iter__(self) -> Iterator[Scene]:
+        return (self[index] for index in range(len(self)))
+
+    def points(self, index: int) -> Tensor:
+        """Points ``(P, 3)`` of one scene in metres, x forward, y left, z up, on the CPU."""
+        return self[index].points
+
+    def point_intensity(self, index: int) -> Tensor:
+        """Intensity ``(P,)`` of each of the points of one scene, on the CPU."""
+        return self[index].point_intensity
+
+    def point_labels(self, index: int) -> Tensor:
+        """Class id of KITTI-360 ``(P,)`` of each of the points of one scene, on the CPU."""
+        return self[index].point_labels
+
+    def save(
+        self, folder: str | Path, formats: Sequence[str] = ("bin",), overwrite: bool = False
+    ) -> Path:
+        """Write the scenes to a folder as ``r3dpa sample`` does; return the folder.
+
+        Args:
+            folder: New folder, or one with earlier scenes and ``overwrite``.
+            formats: Files of points: ``bin``, ``ply``, ``npz``.
+            overwrite: Replace earlier scenes.
+        """
+        from r3dpa.data.scene_writer import SceneWriter
+
+        folder = Path(folder)
+        if (folder / "metadata.json").exists() and not overwrite:
+            raise ValueError(
+                f"{folder} holds scenes already; give another folder or overwrite=True"
+            )
+        about = {"num": len(self), "nfe": self.nfe, "formats": list(formats)}
+        with SceneWriter(folder, len(self), self.projection, formats, about, overwrite) as writer:
+            writer.put(self.range_m, self.nfe, self.intensity, self.labels)
+            writer.close()
+            writer.finish(about)
+        return folder
+
+    def show(self) -> Any:
+        """Return a page with the first point clouds to turn, for the output of a notebook cell.
+
+        Raises:
+            ImportError: If IPython is missing, which notebooks have.
+        """
+        try:
+            from IPython.display import HTML
+        except ImportError as error:
+            raise ImportError(
+                "show() is for notebooks, and needs IPython: pip install ipykernel; elsewhere use "
+                "save() and `r3dpa data view`"
+            ) from error
+        page = html.escape(self._page())
+        # In a block of its own: IPython warns of a bare iframe.
+        return HTML(f'<div><iframe srcdoc="{page}" width="100%" height="600"></iframe></div>')
+
+    def to_open3d(self) -> list[Any]:
+        """Return an ``open3d.geometry.PointCloud`` of each scene, coloured by intensity if known.
+
+        Raises:
+            ImportError: If Open3D is missing.
+        """
+        try:
+            import open3d
+        except ImportError as error:
+            raise ImportError("to_open3d() needs Open3D: pip install open3d") from error
+        clouds = []
+        for scene in self:
+            cloud = open3d.geometry.PointCloud()
+            cloud.points = open3d.utility.Vector3dVector(scene.points.double().numpy())
+            if scene.intensity is not None:
+                grey = scene.point_intensity.double()[:, None].repeat(1, 3)
+                cloud.colors = open3d.utility.Vector3dVector(grey.numpy())
+            clouds.append(cloud)
+        return clouds
+
+    def _repr_png_(self) -> bytes:
+        """Range images of the first scenes, as the output of a notebook cell."""
+        from PIL import Image
+
+        from r3dpa.viz import range_image_picture
+
+        rows = [range_image_picture(scene.range_m, self.projection.sensor) for scene in self]
+        border = np.full((4, *rows[0].shape[1:]), 255, np.uint8)
+        stacked = [part for row in rows[:_PICTURES] for part in (row, border)][:-1]
+        stream = io.BytesIO()
+        Image.fromarray(np.concatenate(stacked)).save(stream, format="PNG")
+        return stream.getvalue()
+
+    def _page(self) -> str:
+        from r3dpa.viz import Category, PageScan, scan_page
+
+        scans = []
+        for index, scene in enumerate(self[:_PAGES]):
+            points = scene.points
+            if scene.intensity is not None:
+                points = torch.cat([points, scene.point_intensity[:, None]], dim=1)
+            labels = None if scene.labels is None else scene.point_labels.numpy()
+            scans.append(PageScan(f"scene {index}", points.numpy(), labels))
+        classes = {semantic.label: Category(semantic.name) for semantic in SEMANTIC_CLASSES}
+        return scan_page(scans, repr(self), classes, {}, sensor=self.projection.sensor)
+
+
+def _describe(range_m: Tensor, intensity: Tensor | None, labels: Tensor | None) -> str:
+    beams, columns = range_m.shape[-2:]
+    known = ["range"]
+    if intensity is not None:
+        known.append("intensity")
+    if labels is not None:
+        known.append("labels")
+    return f"{beams} x {columns} pixels of {', '.join(known)}"

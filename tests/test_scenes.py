@@ -1,0 +1,108 @@
+"""Batches of scenes: parts, files, pages and pictures."""
+
+from __future__ import annotations
+
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from r3dpa.data import read_scan
+from r3dpa.editing import EditResult
+from r3dpa.geometry import LidarSensor, SphericalProjection, points_of
+from r3dpa.scenes import Scene, SceneBatch
+
+PROJECTION = SphericalProjection(LidarSensor(beams=16, columns=64))
+
+
+@pytest.fixture
+def labelled():
+    """Three scenes with a fifth of the pixels empty."""
+    random = torch.Generator().manual_seed(0)
+    returns = torch.rand(3, 16, 64, generator=random) > 0.2
+    range_m = torch.where(returns, 5 + 20 * torch.rand(3, 16, 64, generator=random), -1.0)
+    intensity = torch.where(returns, torch.rand(3, 16, 64, generator=random), 0.0)
+    labels = torch.where(returns, 26, 0)
+    return SceneBatch(range_m, torch.zeros(3, 4, 4, 16), 8, PROJECTION, intensity, labels)
+
+
+@pytest.fixture
+def edited(labelled):
+    return EditResult(labelled.range_m, labelled.latents, 8, PROJECTION, cosine=torch.arange(3.0))
+
+
+def test_a_batch_is_a_sequence_of_scenes(labelled):
+    assert len(labelled) == len(list(labelled)) == 3
+    for index, scene in enumerate(labelled):
+        assert isinstance(scene, Scene)
+        assert scene.points.equal(points_of(labelled.range_m[index], PROJECTION))
+        assert scene.points.equal(labelled.points(index))
+        assert scene.point_intensity.equal(labelled.point_intensity(index))
+        assert scene.point_labels.tolist() == [26] * len(scene.points)
+    assert labelled[-1].range_m.equal(labelled.range_m[2])
+    with pytest.raises(IndexError):
+        labelled[3]
+
+
+def test_a_slice_has_every_part(labelled, edited):
+    assert type(labelled[1:]) is SceneBatch
+    assert labelled[1:].labels.equal(labelled.labels[1:])
+    assert type(edited[:2]) is EditResult
+    assert edited[1:].cosine.tolist() == [1.0, 2.0]
+    assert edited[1:].intensity is None
+
+
+def test_reprs_are_one_line(labelled, edited):
+    assert repr(labelled) == (
+        "SceneBatch(3 scenes, 16 x 64 pixels of range, intensity, labels, 8 evaluations each)"
+    )
+    assert repr(edited) == "EditResult(3 scenes, 16 x 64 pixels of range, 8 evaluations each)"
+    assert repr(edited[0]) == f"Scene({len(edited[0].points)} points, 16 x 64 pixels of range)"
+
+
+def test_saved_scenes_are_those_of_a_sample(labelled, tmp_path):
+    folder = labelled.save(tmp_path / "scenes", ("bin", "npz"))
+    assert folder == tmp_path / "scenes"
+    assert np.array_equal(np.load(folder / "range_m.npy"), labelled.range_m.numpy())
+    points = read_scan(folder / "bin" / "000001.bin")
+    assert np.array_equal(points[:, :3], labelled[1].points.numpy())
+    assert np.array_equal(points[:, 3], labelled[1].point_intensity.numpy())
+    assert (folder / "labels" / "000002.label").stat().st_size == 4 * len(labelled[2].points)
+    with pytest.raises(ValueError, match="holds scenes already"):
+        labelled.save(folder)
+    labelled[:1].save(folder, overwrite=True)
+    assert len(np.load(folder / "range_m.npy")) == 1
+
+
+def test_a_notebook_shows_pictures_and_a_page(labelled, edited):
+    assert labelled._repr_png_().startswith(b"\x89PNG")
+    for batch in (labelled, edited):
+        shown = batch.show().data
+        assert "<iframe srcdoc=" in shown
+        assert "scene 2" in shown
+
+
+@pytest.mark.parametrize(
+    ("module", "call", "message"),
+    [
+        ("IPython.display", "show", "needs IPython: pip install ipykernel"),
+        ("open3d", "to_open3d", "needs Open3D: pip install open3d"),
+    ],
+)
+def test_absent_packages_are_named(labelled, monkeypatch, module, call, message):
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(ImportError, match=message):
+        getattr(labelled, call)()
+
+
+def test_open3d_gets_points_and_intensities(labelled, edited, monkeypatch):
+    """A stand-in for the package, which is large."""
+    utility = SimpleNamespace(Vector3dVector=lambda values: values)
+    geometry = SimpleNamespace(PointCloud=SimpleNamespace)
+    monkeypatch.setitem(sys.modules, "open3d", SimpleNamespace(utility=utility, geometry=geometry))
+    cloud = labelled.to_open3d()[1]
+    assert np.array_equal(cloud.points, labelled[1].points.double().numpy())
+    assert np.array_equal(cloud.colors[:, 2], labelled[1].point_intensity.double().numpy())
+    assert not hasattr(edited.to_open3d()[0], "colors")
