@@ -145,7 +145,8 @@ def test_every_area_has_a_rule():
 
 
 def test_lidarsim_needs_no_torch_and_nothing_of_r3dpa():
-    names = sorted(name for name in modules() if name.startswith("lidarsim"))
+    optional = {"lidarsim.clouds_las"}  # needs laspy
+    names = sorted(name for name in set(modules()) - optional if name.startswith("lidarsim"))
     code = f"""
 import sys, time
 started = time.perf_counter()

@@ -152,10 +152,15 @@ class PointCloud:
         if values is None:
             return np.zeros(len(self), np.float32)
         if full_scale is None:
-            full_scale = self._full_scale(values)
+            full_scale = self.full_intensity
         return values.astype(np.float32) / np.float32(full_scale)
 
-    def _full_scale(self, intensity: NDArray) -> float:
+    @property
+    def full_intensity(self) -> float:
+        """Full scale of the intensities, see :meth:`intensity_shares`; 1 without intensities."""
+        intensity = self.intensity
+        if intensity is None:
+            return 1.0
         num_above = np.count_nonzero(intensity > 1)
         if intensity.dtype.kind == "f" and num_above <= ODD_SHARE * len(self):
             return 1.0

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lidarsim.clouds import PointCloud, read_cloud
 from r3dpa.geometry import (
     SEMANTIC_CLASSES,
     Pixels,
@@ -56,10 +57,11 @@ def scan_pixels(scan: ScanLike, projection: Projection) -> Pixels:
         return map_pixels(torch.Tensor.cpu, scan)
     labels = None
     if isinstance(scan, str | Path):
-        from lidarsim.clouds import read_file
-
-        scan = read_file(Path(scan)).scan
-    if hasattr(scan, "points"):
+        scan = read_cloud(scan)
+    if isinstance(scan, PointCloud):
+        labels, columns = scan.labels, 3 if scan.intensity is None else 4
+        scan = scan.rows()[:, :columns]
+    elif hasattr(scan, "points"):
         labels = getattr(scan, "labels", None)
         intensity = getattr(scan, "intensity", None)
         scan = scan.points
@@ -81,9 +83,8 @@ def scan_pixels(scan: ScanLike, projection: Projection) -> Pixels:
             f"the scan has no point within {sensor.range_min_m:g}..{sensor.range_max_m:g} m; "
             "coordinates must be metres"
         )
-    if labels is not None:
-        labels = torch.from_numpy(np.asarray(labels, dtype=np.int64))
-    return project_pixels(values, projection, labels)
+    given = None if labels is None else torch.from_numpy(np.asarray(labels, dtype=np.int64))
+    return project_pixels(values, projection, given)
 
 
 def map_pixels(function: Callable[[Tensor], Tensor], pixels: Pixels) -> Pixels:

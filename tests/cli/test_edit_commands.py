@@ -9,7 +9,7 @@ from PIL import Image
 from tiny_networks import tiny_checkpoint
 
 from lidarsim import simulate
-from lidarsim.scan_files import read_ply
+from lidarsim.clouds import read_cloud
 from r3dpa import viz
 from r3dpa.cli import edit_session, main
 from r3dpa.data import read_scan, write_bin, write_npz, write_ply
@@ -158,7 +158,8 @@ class TestComplete:
         out = tmp_path / "out"
         edit(files, "complete", out, "--scan", tmp_path / "sparse.ply", "--empty_beams", num=1)
         assert missing_of(out)[1::2].all()
-        given, completed = read_ply(tmp_path / "sparse.ply"), read_ply(out / "scans/sparse.ply")
+        given = read_cloud(tmp_path / "sparse.ply").points
+        completed = read_cloud(out / "scans/sparse.ply").points
         assert completed[: len(given)].tobytes() == given.tobytes()
         assert len(completed) > 1.5 * len(given)
         image = torch.from_numpy(np.load(out / "range_m.npy"))[0]

@@ -15,8 +15,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from tqdm import tqdm
 
-from lidarsim import WeatheredScan
-from lidarsim.clouds import ScanFile, find_files, read_file, write_file
+from lidarsim.changed_scans import write_below
+from lidarsim.clouds import PointCloud, find_files, read_cloud
 from r3dpa.cli.edit_session import EditSession, ScanView
 from r3dpa.cli.parser import EditOptions
 from r3dpa.data.scene_writer import SceneWriter
@@ -102,13 +102,13 @@ class CompletionJob:
     resamplings: int | None
     threads: int | None
 
-    def read(self, path: Path) -> tuple[ScanFile, ScanView, Tensor]:
-        """A file, its view, and the mask of what is missing."""
-        session, file = _session(self.options, self.num), read_file(path)
-        view = session.view(path, file.scan, only_in_view=True)
+    def read(self, path: Path) -> tuple[PointCloud, ScanView, Tensor]:
+        """A scan, its view, and the mask of what is missing."""
+        session, cloud = _session(self.options, self.num), read_cloud(path)
+        view = session.view(path, cloud, only_in_view=True)
         missing = self.missing.find(view.range_m, session)
         session.check(view, missing)
-        return file, view, missing
+        return cloud, view, missing
 
     def __call__(self, task: tuple[int, Path]) -> Completion:
         """Complete the scan of a number and file."""
@@ -116,7 +116,7 @@ class CompletionJob:
             torch.set_num_threads(self.threads)
         number, path = task
         session = _session(self.options, self.num)
-        file, view, missing = self.read(path)
+        cloud, view, missing = self.read(path)
         if session.baseline is not None:
             result = session.complete(view, missing, self.resamplings or 10)
         else:
@@ -125,9 +125,9 @@ class CompletionJob:
                 view.pixels, missing, self.num, self.options.seed, **start
             )
         for index in range(self.num):
-            completed = _completed_file(file, result, index, missing)
+            completed = _completed_cloud(cloud, result, index, missing)
             folder = self.options.out / _SCANS
-            write_file(completed, self.root, folder / str(index) if self.num > 1 else folder)
+            write_below(completed, self.root, folder / str(index) if self.num > 1 else folder)
         intensity = None if result.intensity is None else result.intensity.numpy()
         return Completion(number, result.range_m.numpy(), intensity, result.nfe)
 
@@ -204,42 +204,34 @@ def _in_order(
                 expected = next(following, None)
 
 
-def _completed_file(file: ScanFile, result: EditResult, index: int, missing: Tensor) -> ScanFile:
-    """The file with all its points, and generated ones where the scan has no point.
+def _completed_cloud(
+    cloud: PointCloud, result: EditResult, index: int, missing: Tensor
+) -> PointCloud:
+    """Scan with all its points, and generated ones where it has no point.
 
     Intensity and further columns of generated points are those of the nearest point of the scan, if
     the model has no intensity; labels are those of the model, else 0.
     """
-    scan, projection = file.scan, result.projection
-    filled = missing & ~_occupied(torch.from_numpy(scan.points), projection)
-    range_m = torch.where(filled, result.range_m[index], -1.0)
+    points, projection = cloud.points.astype(np.float32), result.projection
+    empty = missing & ~_occupied(torch.from_numpy(points), projection)
+    range_m = torch.where(empty, result.range_m[index], -1.0)
     added = points_of(range_m, projection).numpy()
-    nearest = cKDTree(scan.points).query(added)[1].astype(np.int64)
-    intensity, labels = scan.intensity, scan.labels
+    nearest = cKDTree(points).query(added)[1].astype(np.int64)
+    intensity, labels = cloud.intensity, cloud.labels
     if intensity is not None:
-        new = intensity[nearest]
+        added_intensity = intensity[nearest]
         if result.intensity is not None:
-            image = result.intensity[index]
-            new = values_at_returns(image, range_m, projection).numpy().astype(intensity.dtype)
-        intensity = np.concatenate([intensity, new])
+            shares = values_at_returns(result.intensity[index], range_m, projection).numpy()
+            added_intensity = (cloud.full_intensity * shares).astype(intensity.dtype)
+        intensity = np.concatenate([intensity, added_intensity])
     if labels is not None:
-        new_labels = np.zeros(len(added), labels.dtype)
+        added_labels = np.zeros(len(added), labels.dtype)
         if result.labels is not None:
-            image = result.labels[index]
-            new_labels = values_at_returns(image, range_m, projection).numpy().astype(labels.dtype)
-        labels = np.concatenate([labels, new_labels])
-    own = np.arange(len(scan))
-    completed = WeatheredScan(
-        points=np.concatenate([scan.points, added]),
-        intensity=intensity,
-        labels=labels,
-        index=np.concatenate([own, np.full(len(added), -1)]),
-        shot=np.concatenate([own, nearest]),
-        origins=np.zeros(len(scan) + len(added), np.uint8),
-        effects=(),
-        report={},
-    )
-    return file.changed(completed)
+            classes = values_at_returns(result.labels[index], range_m, projection)
+            added_labels = classes.numpy().astype(labels.dtype)
+        labels = np.concatenate([labels, added_labels])
+    rows = np.concatenate([np.arange(len(cloud)), nearest])
+    return cloud.changed(rows, np.concatenate([points, added]), intensity, labels)
 
 
 def _occupied(points: Tensor, projection: Projection) -> Tensor:

@@ -16,13 +16,13 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from lidarsim.recorded import RecordedScan
-from lidarsim.scan_files import out_of_range
+from lidarsim.clouds import PointCloud
+from lidarsim.scan_files import out_of_range, read_clouds
 from r3dpa import viz
 from r3dpa.baselines import BASELINES, scene_generator
 from r3dpa.checkpoints import read_checkpoint
 from r3dpa.cli.parser import EditOptions
-from r3dpa.cli.scene_files import draw_scene, feature_source_of, provenance, read_clouds
+from r3dpa.cli.scene_files import draw_scene, feature_source_of, provenance
 from r3dpa.data import PointSample, Scan, ScanError, pooled_grids
 from r3dpa.data.images import read_mask
 from r3dpa.data.scene_writer import SceneWriter
@@ -119,20 +119,16 @@ class EditSession:
         self.check(scan)
         return scan
 
-    def view(self, path: Path, scan: RecordedScan, only_in_view: bool = False) -> ScanView:
+    def view(self, path: Path, cloud: PointCloud, only_in_view: bool = False) -> ScanView:
         """View of a scan that was read; unchecked.
 
         ``only_in_view`` leaves out points above and below the field of view, which otherwise land
         in the first and last row.
         """
-        points = torch.zeros(len(scan), 4)
-        points[:, :3] = torch.from_numpy(scan.points)
-        if scan.intensity is not None:
-            points[:, 3] = torch.from_numpy(scan.intensity.astype(np.float32))
         labels = None
-        if scan.labels is not None:
-            labels = torch.from_numpy(scan.labels.astype(np.int64))
-        return self._project(path, points, labels, only_in_view)
+        if cloud.labels is not None:
+            labels = torch.from_numpy(cloud.labels.astype(np.int64))
+        return self._project(path, torch.from_numpy(cloud.rows()), labels, only_in_view)
 
     def _project(
         self,
