@@ -127,7 +127,9 @@ def training(
 
 
 def _experiments(conf: Path, stage: str, quick: bool) -> list[Path]:
-    paths = [conf / "experiment" / f"{name}.yaml" for name in [stage, f"{stage}_demo"][: 1 + quick]]
+    paths = [conf / "experiment" / f"{stage}.yaml"]
+    if quick:
+        paths.append(conf / "demo" / f"{stage}.yaml")
     for path in paths:
         if not path.is_file():
             raise ValueError(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import uuid
 import warnings
+from collections.abc import Sequence
 from contextlib import nullcontext
 from importlib.resources import files
 from pathlib import Path
@@ -50,6 +51,26 @@ def ignore_harmless_warnings() -> None:
 def conf_folder() -> Path:
     """Folder of the shipped configurations, in a checkout and in an installed package alike."""
     return Path(str(files("r3dpa") / "conf"))
+
+
+def shipped(path: str | Path) -> Path:
+    """The file, or the one of the package where ``conf/...`` does not exist here."""
+    of_package = conf_folder().parent / path
+    is_shipped = not Path(path).exists() and of_package.exists()
+    return of_package if is_shipped else Path(path)
+
+
+def _with_shipped(words: Sequence[str]) -> list[str]:
+    """The words with the files after ``--config`` as :func:`shipped` finds them."""
+    found: list[str] = []
+    for word in words:
+        name, _, value = word.partition("=")
+        if name == "--config" and value.startswith("conf/"):
+            word = f"--config={shipped(value)}"
+        elif found[-1:] == ["--config"] and word.startswith("conf/"):
+            word = str(shipped(word))
+        found.append(word)
+    return found
 
 
 class _RecordConfig(SaveConfigCallback):
@@ -221,9 +242,9 @@ def _with_preset(words: list[str]) -> list[str]:
         if name not in known:
             raise ValueError(f"there is no {kind} {name!r}; give one of {', '.join(known)}")
     data = "dead_leaves" if demo and stage in ("image_vae", "rgb_pretraining") else preset
-    names = ["trainer", *(["trainer_demo"] if demo else []), f"data/{data}", stages[stage]]
-    if demo and f"{stage}_demo" in stages:
-        names.append(stages[f"{stage}_demo"])
+    names = ["trainer", *(["demo/trainer"] if demo else []), f"data/{data}", stages[stage]]
+    if demo and (conf / "demo" / f"{stage}.yaml").is_file():
+        names.append(f"demo/{stage}")
     configs = [word for name in names for word in ("--config", str(conf / f"{name}.yaml"))]
     return [*configs, "--run_dir", f"runs/{preset}/{stage}", *rest]
 
@@ -231,4 +252,4 @@ def _with_preset(words: list[str]) -> list[str]:
 def run(args: list[str]) -> None:
     """Runs a stage command: ``["fit", "--config", "x.yaml"]``, ``["fit", "joint"]``."""
     ignore_harmless_warnings()
-    StageCLI([args[0], *_with_preset(args[1:])])
+    StageCLI([args[0], *_with_shipped(_with_preset(args[1:]))])
