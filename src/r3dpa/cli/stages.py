@@ -111,6 +111,7 @@ class StageCLI(LightningCLI):
 
     def __init__(self, args: list[str]) -> None:
         self._command = args[0]
+        self._ckpt_step: int | None = None
         super().__init__(
             LightningModule,
             LightningDataModule,
@@ -148,7 +149,7 @@ class StageCLI(LightningCLI):
         if config.get("ckpt_path") == "last":
             config.ckpt_path = _newest(Path(config.run_dir))
         if config.get("ckpt_path"):
-            read_checkpoint(config.ckpt_path)
+            self._ckpt_step = read_checkpoint(config.ckpt_path).step
             if Path(config.ckpt_path).suffix != ".ckpt":  # released or exported
                 raise ValueError(
                     f"--ckpt_path {config.ckpt_path} is no .ckpt of a run; scenes of other files "
@@ -184,7 +185,12 @@ class StageCLI(LightningCLI):
         if self._ckpt_path is None:
             raise ValueError(f"{self.subcommand} needs trained weights: give --ckpt_path")
 
-    before_validate = before_test = before_predict
+    def before_validate(self) -> None:
+        """Refuses to use random weights, and logs at the step of the checkpoint, not at 0."""
+        self.before_predict()
+        self.trainer.fit_loop.epoch_loop._batches_that_stepped = self._ckpt_step or 0
+
+    before_test = before_validate
 
     @property
     def _ckpt_path(self) -> str | None:
