@@ -94,7 +94,7 @@ def test_quick_measures_the_small_networks_in_a_process_of_their_own(small_conf,
 
 
 def test_a_missing_experiment_is_named(tmp_path):
-    with pytest.raises(ValueError, match=r"experiment/joint\.yaml.*conf"):
+    with pytest.raises(ValueError, match=r"experiment/joint\.yaml does not exist; choose"):
         training(tmp_path, ("joint",))
 
 

@@ -63,7 +63,7 @@ def sampling(
     The same command completes an interrupted run.
 
     Args:
-        out: Folder for tables, pictures and ``quality.json``.
+        out: Folder for table, picture and figures.
         ckpt: Checkpoint of stage joint or flow_matching, such as ``r3dpa-s``; default: only a
             mixture of Gaussians whose velocity is exact.
         quick: Few scenes, steps and rounds: minutes on a CPU.

@@ -181,7 +181,7 @@ def pareto_figure(
         Line2D([], [], color=colour, marker=marker, linestyle="none", label=solver)
         for solver, (colour, marker) in styles.items()
     ]
-    entries.append(Line2D([], [], color="#222222", label="Pareto front (95 %)"))
+    entries.append(Line2D([], [], color="#222222", label="Pareto front"))
     for style, (name, value) in zip(("--", "-.", ":"), levels.items(), strict=False):
         line = axes.axhline(value, color="#555555", linewidth=1.0, linestyle=style, zorder=1)
         line.set_label(f"{name}: {value:.3g}")
