@@ -6,12 +6,12 @@ import ctypes
 import json
 import os
 import signal
-import subprocess
 import sys
 import time
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
+from subprocess import Popen
 from typing import Any, NamedTuple
 
 import yaml
@@ -80,7 +80,7 @@ def run_plan(plan: Plan, say: Callable[[str], None], jobs: int = 1) -> dict[str,
         say(f"{len(every) - num_jobs} of {len(every)} are done already")
     cores = max(1, (os.cpu_count() or 1) // jobs)
     job_of = {job.name: job for job in every}
-    running: dict[str, subprocess.Popen[bytes]] = {}
+    running: dict[str, Popen[bytes]] = {}
     began: dict[str, float] = {}
     failed: dict[str, str] = {}
     try:
@@ -117,7 +117,7 @@ def run_plan(plan: Plan, say: Callable[[str], None], jobs: int = 1) -> dict[str,
     return failed
 
 
-def start(job: Job, cores: int) -> subprocess.Popen[bytes]:
+def start(job: Job, cores: int) -> Popen[bytes]:
     """Start the process of a job; its output goes to the log."""
     if job.words[0] == "fit":  # one that a killed call has left may still train
         with only_writer(job.place.parent / ".fit.lock", f"trains {job.name}", wait=True):
@@ -128,7 +128,7 @@ def start(job: Job, cores: int) -> subprocess.Popen[bytes]:
     # Without a safe path `python -m` and its own processes import files of the current folder.
     environment = {"OMP_NUM_THREADS": str(cores)} | os.environ | {"PYTHONSAFEPATH": "1"}
     with open(job.log, "ab", opener=no_follow) as log:
-        return subprocess.Popen(
+        return Popen(
             [sys.executable, "-m", "r3dpa", *job.words],
             stdout=log,
             stderr=log,
