@@ -258,4 +258,4 @@ def _log_row(
                     run.log({f"{prefix}/step": step, f"{prefix}/{name}": value})
         for path in sorted(stages[-1].evaluation.parent.rglob("*.png")):
             run.log({f"samples/{path.stem}": wandb.Image(str(path))})
-        run.summary.update(summary)
+        run.summary.update(dict(summary))

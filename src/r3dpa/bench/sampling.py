@@ -261,12 +261,14 @@ def _concatenate(parts: Sequence[Solved]) -> Solved:
 def reference(problem: Problem, steps: int, num: int, work: Work) -> tuple[Solved, float]:
     """The converged solution, and the RMSE of its latents from those of half the steps."""
 
+    def converged(count: int, indices: range) -> tuple[Tensor, Tensor | None]:
+        return tuple(problem.converged(count, indices))
+
     def solve(count: int) -> Solved:
         parts = []
         for indices in _bar(_batches(problem, num), f"Heun-{count}"):
-            run = partial(problem.converged, count, indices)
-            name = f"reference_{count}_{indices.start}"
-            parts.append(Solved(*work.piece(name, lambda run=run: tuple(run()))))
+            run = partial(converged, count, indices)
+            parts.append(Solved(*work.piece(f"reference_{count}_{indices.start}", run)))
         return _concatenate(parts)
 
     solved = solve(steps)
