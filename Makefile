@@ -19,7 +19,7 @@ else
 SOURCE := --config conf/data/demo_folder.yaml --data.init_args.scans $(DATA) \
 	--data.init_args.features_dir $(OUT)/feature_grids
 endif
-FIT := $(BIN)/r3dpa fit --config conf/trainer.yaml --config conf/trainer_demo.yaml $(SOURCE)
+FIT := $(BIN)/r3dpa fit --config conf/trainer.yaml --config conf/demo/trainer.yaml $(SOURCE)
 else
 ifeq ($(DATA),)
 SOURCE := --config conf/r3dpa_s/demo_data.yaml
@@ -88,8 +88,8 @@ ifneq ($(SCRATCH),)
 demo: $(READY) ## the weights of the package, then trained on: make demo [DATA=folder of .bin scans] [SCRATCH=1]
 	rm -rf $(OUT)/vae_alignment $(OUT)/joint
 	$(FIT) --config conf/experiment/vae_alignment.yaml \
-		--config conf/experiment/vae_alignment_demo.yaml --run_dir $(OUT)/vae_alignment
-	$(FIT) --config conf/experiment/joint.yaml --config conf/experiment/joint_demo.yaml \
+		--config conf/demo/vae_alignment.yaml --run_dir $(OUT)/vae_alignment
+	$(FIT) --config conf/experiment/joint.yaml --config conf/demo/joint.yaml \
 		--run_dir $(OUT)/joint \
 		--model.init_args.init_from $(OUT)/vae_alignment/checkpoints/last.ckpt
 	$(BIN)/r3dpa sample --ckpt $(OUT)/joint/checkpoints/last.ckpt --out $(OUT)/scenes \
@@ -129,7 +129,8 @@ r3dpa-s: $(READY) ## train the weights of the package: an hour of a GPU, days of
 		--model.init_args.init_from runs/r3dpa_s/vae_more/checkpoints/last.ckpt
 	$(R3DPA_S_FIT) --config conf/r3dpa_s/flow_matching.yaml --run_dir runs/r3dpa_s/flow \
 		--model.init_args.init_from runs/r3dpa_s/vae_decoder/checkpoints/last.ckpt
-	$(R3DPA_S_FIT) --config conf/r3dpa_s/few_step.yaml --run_dir runs/r3dpa_s/few_step \
+	$(R3DPA_S_FIT) --config conf/r3dpa_s/flow_matching.yaml --config conf/r3dpa_s/few_step.yaml \
+		--run_dir runs/r3dpa_s/few_step \
 		--model.init_args.init_from runs/r3dpa_s/flow/checkpoints/last.ckpt \
 		--model.init_args.latents_dir runs/r3dpa_s/flow/latents
 	$(BIN)/r3dpa convert runs/r3dpa_s/few_step/checkpoints/last.ckpt runs/r3dpa_s/r3dpa-s.safetensors \

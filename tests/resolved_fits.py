@@ -4,4 +4,4 @@ from functools import cache
 
 from r3dpa.cli import bench
 
-resolved = cache(bench._resolved)
+resolved = cache(bench.resolve_config)

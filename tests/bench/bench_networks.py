@@ -24,7 +24,7 @@ def vae_of(name):
     config = yaml.safe_load((CONF / f"vae_{name}.yaml").read_text())
     module, _, kind = config["class_path"].rpartition(".")
     torch.manual_seed(0)
-    return getattr(import_module(module), kind)(**config["init_args"]).eval()
+    return getattr(import_module(module), kind)(**config.get("init_args", {})).eval()
 
 
 @pytest.mark.parametrize("precision", ["fp32", "bf16"])

@@ -25,15 +25,19 @@ def small_conf(tmp_path_factory):
     conf = tmp_path_factory.mktemp("conf")
     smoke = yaml.safe_load((CONF / "smoke.yaml").read_text())["model"]["init_args"]
     (conf / "experiment").mkdir()
+    (conf / "demo").mkdir()
     for stage in STAGES:
         config = yaml.safe_load((CONF / "experiment" / f"{stage}.yaml").read_text())
         arguments = config["model"]["init_args"] | smoke
         if "discriminator" in arguments:
-            arguments["discriminator"] = str(CONF / "net" / "discriminator_demo.yaml")
+            arguments["discriminator"] = {
+                "class_path": "r3dpa.nn.PatchDiscriminator",
+                "init_args": {"channels": 16},
+            }
         config["model"]["init_args"] = arguments
         (conf / "experiment" / f"{stage}.yaml").write_text(yaml.safe_dump(config))
         smaller = {"model": {"init_args": {"sit": {"init_args": {"hidden_size": 16}}}}}
-        (conf / "experiment" / f"{stage}_demo.yaml").write_text(yaml.safe_dump(smaller))
+        (conf / "demo" / f"{stage}.yaml").write_text(yaml.safe_dump(smaller))
     return conf
 
 
@@ -90,7 +94,7 @@ def test_quick_measures_the_small_networks_in_a_process_of_their_own(small_conf,
 
 
 def test_a_missing_experiment_is_named(tmp_path):
-    with pytest.raises(ValueError, match=r"experiment/joint\.yaml.*conf"):
+    with pytest.raises(ValueError, match=r"experiment/joint\.yaml does not exist; choose"):
         training(tmp_path, ("joint",))
 
 

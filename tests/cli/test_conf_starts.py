@@ -18,27 +18,29 @@ from r3dpa.nn import VAE, LatentNorm, SiT, UNet
 
 THIN_DECODER = {"latent_channels": 4, "channels": 32, "num_res_blocks": 0}
 THIN_DECODER |= {"channel_multipliers": [1, 1, 1], "strides": [[2, 2], [2, 2]]}
+TINY_UNET = {"input_size": [4, 16], "in_channels": 4, "channels": 32, "num_res_blocks": 1}
+TINY_UNET |= {"channel_multipliers": [1, 2], "feature_dim": 16, "projector_dim": 32}
 CONF = Path(__file__).resolve().parents[2] / "conf"
 ELSEWHERE = {  # by the test that starts them
-    "test_rgb_stages": "data/dead_leaves data/images experiment/image_vae net/image_vae_demo "
-    "experiment/rgb_pretraining experiment/rgb_pretraining_demo net/sd_vae",
-    "test_shipped_networks": "net/vae_h2p4d8 net/vae_h1p4d4 net/vae_h16d4 net/vae_h16p2d16 "
-    "net/vae_demo",
+    "test_rgb_stages": "data/dead_leaves data/images experiment/image_vae "
+    "experiment/rgb_pretraining demo/rgb_pretraining net/sd_vae",
+    "test_shipped_networks": "net/vae_h2p4d8 net/vae_h1p4d4 net/vae_h16d4 net/vae_h16p2d16",
     "test_stage_cli": "data/points experiment/waffleiron_s",
     "test_documented_commands": "launch/nodes",
-    "test_baselines": " ".join(f"baseline/{path.stem}" for path in CONF.glob("baseline/*.yaml")),
-    "part of experiments here": "net/discriminator net/discriminator_demo",
+    "test_baselines": "demo/lidm demo/lidm_first_stage demo/r2dm demo/r2flow "
+    + " ".join(f"baseline/{path.stem}" for path in CONF.glob("baseline/*.yaml")),
     "test_ablate": " ".join(
         p.relative_to(CONF).with_suffix("").as_posix() for p in CONF.glob("ablation/**/*.yaml")
     ),
 }
-EXPERIMENTS = ("vae_alignment", "joint", "flow_matching", "few_step")
-STARTS = {  # each after the YAML of its stage, which test_stages starts alone
-    "vae_alignment_demo": "kitti360",
-    "joint_demo": "demo_folder",
-    "flow_matching_demo": "demo",
-    "few_step_demo": "simulated",
-    "joint": "folder",
+EXPERIMENTS = ("vae_alignment", "joint", "joint_unet", "flow_matching", "few_step")
+STARTS = {  # data by overlay of the demo or experiment; test_stages starts the experiments alone
+    "demo/vae_alignment": "kitti360",
+    "demo/joint": "demo_folder",
+    "demo/joint_unet": "demo",
+    "demo/flow_matching": "demo",
+    "demo/few_step": "simulated",
+    "experiment/joint": "folder",
 }
 R3DPA_S = {  # in the order given
     "trained": ("data", "vae_alignment"),
@@ -46,7 +48,7 @@ R3DPA_S = {  # in the order given
     "labels": ("data", "data_labels", "vae_alignment", "vae_alignment_labels"),
     "decoder": ("data", "vae_alignment", "vae_decoder"),
     "flow": ("data", "flow_matching"),
-    "few_step": ("data", "few_step"),
+    "few_step": ("data", "flow_matching", "few_step"),
     "demo": ("demo_data", "vae_alignment", "demo_vae"),
     "demo_flow": ("demo_folder", "flow_matching", "demo_flow"),
 }
@@ -68,14 +70,14 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*fast_dev_run.*")
 
 def test_no_file_is_left_out():
     files = {path.relative_to(CONF).with_suffix("").as_posix() for path in CONF.rglob("*.yaml")}
-    started = {"smoke", "trainer", "trainer_demo"}
-    started |= {f"experiment/{name}" for name in (*STARTS, *EXPERIMENTS)}
+    started = {"smoke", "trainer", "demo/trainer", *STARTS}
+    started |= {f"experiment/{name}" for name in EXPERIMENTS}
     started |= {f"data/{name}" for name in STARTS.values()}
     started |= {f"net/{name}" for name in VELOCITIES}
     started |= {
         f"r3dpa_s/{name}"
         for names in R3DPA_S.values()
-        for name in (*names, "vae", "vae_labels", "sit", "trainer")
+        for name in (*names, "vae", "sit", "trainer")
     }
     elsewhere = set(" ".join(ELSEWHERE.values()).split())
     assert files == started | elsewhere
@@ -101,7 +103,8 @@ def start(tmp_path, caplog):
 
 def start_flow(folder, vae, size, sit=None, codec=RangeCodec()):
     """Setting with the checkpoint that a flow or, with a SiT, few steps start from."""
-    network, channels = VAE(**vae), vae["latent_channels"]
+    network = VAE(**vae)
+    channels = network.latent_channels
     norm = LatentNorm(channels)
     norm.num_batches_tracked.fill_(1)
     rows, columns = (side // s for side, s in zip(size, network.stride, strict=True))
@@ -120,17 +123,18 @@ def start_flow(folder, vae, size, sit=None, codec=RangeCodec()):
 
 
 def net(name):
-    return yaml.safe_load((CONF / f"net/{name}.yaml").read_text())["init_args"]
+    return yaml.safe_load((CONF / f"net/{name}.yaml").read_text()).get("init_args", {})
 
 
 @pytest.mark.parametrize(("experiment", "data"), STARTS.items())
 def test_experiments_with_tiny_networks(experiment, data, start, smoke_root, tmp_path):
     """Each with other data, all of which are the scans of the smoke size here."""
     simulate(smoke_root, 12)  # unless they are there
-    stage = experiment.removesuffix("_demo")
-    configs = ["trainer", f"experiment/{stage}", "smoke", f"data/{data}"]
-    if stage != experiment:
-        configs[1:2] = ["trainer_demo", f"experiment/{stage}", f"experiment/{experiment}"]
+    folder, stage = experiment.split("/")
+    configs = ["trainer", f"data/{data}", f"experiment/{stage}"]
+    if folder == "demo":
+        configs += ["demo/trainer", experiment]
+    configs += ["smoke", f"data/{data}"]  # again, in place of the data of smoke.yaml
     settings = {
         f"data.init_args.{'scans' if 'folder' in data else 'root'}": smoke_root,
         "data.init_args.sensor": "{beams: 16, columns: 64}",
@@ -148,6 +152,10 @@ def test_experiments_with_tiny_networks(experiment, data, start, smoke_root, tmp
             "model.init_args.sit.init_args.average_blocks": 1,
             "model.init_args.thin_decoder.init_args": json.dumps(THIN_DECODER),
         }
+    if stage == "joint_unet":
+        settings["model.init_args.sit"] = json.dumps(
+            {"class_path": "r3dpa.nn.UNet", "init_args": TINY_UNET}
+        )
     start(configs, settings)
 
 
@@ -180,22 +188,24 @@ def test_r3dpa_s_and_its_demo_start(name, start, smoke_root, tmp_path):
     start(configs, settings)
 
 
-def test_demo_grids_are_the_tokens_and_features_come_from_shipped_weights():
+def test_feature_grids_have_the_tokens_of_the_sit_and_come_from_shipped_weights():
+    demo = yaml.safe_load((CONF / "demo/joint.yaml").read_text())["model"]["init_args"]["sit"]
     for data in set(STARTS.values()):
         settings = yaml.safe_load((CONF / f"data/{data}.yaml").read_text())["data"]["init_args"]
         assert settings["extractor"]["class_path"].endswith("WaffleIronS")
-        sit = net("sit_demo" if "demo" in data else "sit_b2")
-        assert settings["grid_size"] == [size // sit["patch_size"] for size in sit["input_size"]]
+        with torch.device("meta"):
+            sit = SiT(**(demo["init_args"] if "demo" in data else net("sit_b2")))
+        assert tuple(settings["grid_size"]) == sit.grid_size
 
 
 @pytest.mark.parametrize("name", VELOCITIES)
 def test_velocity_networks_are_built_at_their_own_size(name):
     with torch.device("meta"):
         network = (SiT if name.startswith("sit") else UNet)(**net(name))
-        latents = torch.empty(2, net(name)["in_channels"], *net(name)["input_size"])
+        latents = torch.empty(2, network.in_channels, *network.input_size)
         output = network(latents, torch.empty(2))
     assert output.velocity.shape == latents.shape
-    assert output.features.shape[2] == net(name)["feature_dim"]
+    assert output.features.shape[2] == network.feature_dim
 
 
 @pytest.mark.slow
@@ -205,7 +215,7 @@ def test_experiments_at_their_own_size(stage, start, smoke_root, tmp_path):
     settings = SIMULATED | {
         "data.init_args.root": smoke_root,
         "data.init_args.extractor": WIDE,
-        "data.init_args.features_dir": smoke_root / "wide_grids",
+        "data.init_args.features_dir": smoke_root / f"wide_grids_{stage}",
         "trainer.callbacks": [],
         "trainer.limit_val_batches": 0,
     }

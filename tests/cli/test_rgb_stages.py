@@ -58,12 +58,12 @@ def steps(number):
 
 @pytest.fixture(scope="module")
 def image_vae(tmp_path_factory):
-    configs = ["trainer", "trainer_demo", "data/dead_leaves", "experiment/image_vae"]
+    configs = ["trainer", "demo/trainer", "data/dead_leaves", "experiment/image_vae"]
     return fit(tmp_path_factory.mktemp("image_vae"), configs, LEAVES, VAE, steps(2))
 
 
-DEMO = ("trainer", "trainer_demo", "data/dead_leaves")
-RGB = (*DEMO, "experiment/rgb_pretraining", "experiment/rgb_pretraining_demo")
+DEMO = ("trainer", "demo/trainer", "data/dead_leaves")
+RGB = (*DEMO, "experiment/rgb_pretraining", "demo/rgb_pretraining")
 
 
 @pytest.fixture(scope="module")

@@ -216,8 +216,12 @@ def test_report_draws_curves_and_lists_the_means_of_their_ends(tmp_path, capsys)
         (tmp_path / f"version_{version}").mkdir()
         text = "\n".join(["step,train/loss", *rows, ""])
         (tmp_path / f"version_{version}" / "metrics.csv").write_text(text)
+    (tmp_path / "version_2").mkdir()  # of `r3dpa validate`, which is no part of the training
+    (tmp_path / "version_2" / "metrics.csv").write_text("step,val/loss\n0,99\n")
     main(["report", str(tmp_path)])
     with Image.open(tmp_path / "loss_curves.png") as picture:
         assert min(picture.size) >= 100
-    (row,) = [x for x in capsys.readouterr().out.splitlines() if x.startswith("train/loss")]
+    printed = capsys.readouterr().out
+    assert "val/loss" not in printed
+    (row,) = [x for x in printed.splitlines() if x.startswith("train/loss")]
     assert row.split()[1:] == ["19.5", "1.5", "-18"]

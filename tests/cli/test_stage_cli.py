@@ -1,5 +1,6 @@
 """``r3dpa fit | validate`` with stages other than those of range images; presets, wandb."""
 
+import csv
 import re
 import warnings
 from pathlib import Path
@@ -11,7 +12,8 @@ import yaml
 from lightning.pytorch.demos.boring_classes import BoringModel
 
 from r3dpa.cli import main
-from r3dpa.cli.stages import ignore_harmless_warnings
+from r3dpa.cli.features import with_data_class
+from r3dpa.cli.stages import conf_folder, ignore_harmless_warnings
 from r3dpa.features import feature_source
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
@@ -53,6 +55,12 @@ def test_any_lightning_module_is_trained_resumed_and_evaluated(tmp_path, capsys)
     capsys.readouterr()
     main(["validate", *arguments, "--ckpt_path", str(last)])
     assert "held_out_loss" in capsys.readouterr().out
+    arguments.remove("--trainer.logger=false")
+    logger = ["--trainer.logger=CSVLogger", "--trainer.logger.save_dir=x"]
+    main(["validate", *arguments, *logger, "--ckpt_path", "last"])
+    (log,) = tmp_path.rglob("metrics.csv")
+    (row,) = csv.DictReader(log.open())
+    assert row["step"] == "4"  # of the checkpoint: a row at step 0 would start its curve
     with pytest.raises(ValueError, match="validate needs trained weights: give --ckpt_path"):
         main(["validate", *arguments])
 
@@ -94,6 +102,22 @@ def test_presets_are_the_shipped_configurations(capsys, tmp_path, monkeypatch):
     assert (config["run_dir"], config["trainer"]["max_steps"]) == ("runs/demo/joint", 7)
     with pytest.raises(ValueError, match=r"there is no data 'kitti'; give one of .*kitti360"):
         main(["fit", "joint", "--preset", "kitti"])
+
+
+def test_shipped_files_are_found_from_everywhere(capsys, tmp_path, monkeypatch):
+    """As after an installation of the package; a file of the user with that name goes first."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "conf").mkdir()
+    (tmp_path / "conf" / "trainer.yaml").write_text("trainer: {max_steps: 7}")
+    words = ["--config", "conf/trainer.yaml", "--config=conf/data/demo.yaml"]
+    with pytest.raises(SystemExit) as ended:
+        main(["fit", *words, "--config", "conf/experiment/joint.yaml", "--print_config"])
+    assert ended.value.code == 0
+    config = yaml.safe_load(capsys.readouterr().out)
+    assert config["model"]["class_path"] == "r3dpa.modules.JointAlignment"
+    assert config["data"]["init_args"]["root"] == "runs/demo/data"
+    assert config["trainer"]["logger"] is None
+    assert with_data_class(["--data", "conf/data/kitti360.yaml"])[1].startswith(str(conf_folder()))
 
 
 def test_evaluation_joins_the_wandb_run_of_the_training(tmp_path):

@@ -24,24 +24,24 @@ VAE_ALONE = {"vae", "discriminator"}
 ALIGNED_VAE = VAE_ALONE | {"sit.projector", "sit.x_embedder"}
 # What is trained in each stage on scans, and what the alignment loss reaches of it.
 EXPECTED = {
-    ("table_2", "1_scratch"): [(VAE_ALONE, set()), ({"sit"}, set())],
-    ("table_2", "2_rgb"): [(VAE_ALONE, set()), ({"sit"}, set())],
-    ("table_2", "3_aligned"): [(ALIGNED_VAE, {"vae", "sit"}), ({"sit"}, set())],
-    ("table_3", "1_none"): [(ALIGNED_VAE, {"vae", "sit"}), ({"sit"}, set())],
-    ("table_3", "2_vanilla"): [(ALIGNED_VAE, {"vae", "sit"}), ({"sit"}, {"sit"})],
-    ("table_3", "3_joint"): [(ALIGNED_VAE, {"vae", "sit"}), ({*VAE_ALONE, "sit"}, {"vae", "sit"})],
-    ("table_4", "1_unet"): [({*VAE_ALONE, "sit"}, {"vae", "sit"})],
-    ("table_4", "2_sit"): [({*VAE_ALONE, "sit"}, {"vae", "sit"})],
+    ("table_2", "scratch"): [(VAE_ALONE, set()), ({"sit"}, set())],
+    ("table_2", "rgb"): [(VAE_ALONE, set()), ({"sit"}, set())],
+    ("table_2", "aligned"): [(ALIGNED_VAE, {"vae", "sit"}), ({"sit"}, set())],
+    ("table_3", "none"): [(ALIGNED_VAE, {"vae", "sit"}), ({"sit"}, set())],
+    ("table_3", "vanilla"): [(ALIGNED_VAE, {"vae", "sit"}), ({"sit"}, {"sit"})],
+    ("table_3", "joint"): [(ALIGNED_VAE, {"vae", "sit"}), ({*VAE_ALONE, "sit"}, {"vae", "sit"})],
+    ("table_4", "unet"): [({*VAE_ALONE, "sit"}, {"vae", "sit"})],
+    ("table_4", "sit"): [({*VAE_ALONE, "sit"}, {"vae", "sit"})],
 }
 STARTS = {  # networks that the last stage takes from the stage before; from the RGB model
-    ("table_2", "1_scratch"): (["vae", "latent_norm"], False),
-    ("table_2", "2_rgb"): (["vae", "latent_norm"], True),
-    ("table_2", "3_aligned"): (["vae", "sit", "latent_norm"], False),
-    ("table_3", "1_none"): (["vae", "sit", "latent_norm"], False),
-    ("table_3", "2_vanilla"): (["vae", "sit", "latent_norm"], False),
-    ("table_3", "3_joint"): (None, False),  # all four, the default of the joint stage
-    ("table_4", "1_unet"): (None, False),
-    ("table_4", "2_sit"): (None, False),
+    ("table_2", "scratch"): (["vae", "latent_norm"], False),
+    ("table_2", "rgb"): (["vae", "latent_norm"], True),
+    ("table_2", "aligned"): (["vae", "sit", "latent_norm"], False),
+    ("table_3", "none"): (["vae", "sit", "latent_norm"], False),
+    ("table_3", "vanilla"): (["vae", "sit", "latent_norm"], False),
+    ("table_3", "joint"): (None, False),  # all four, the default of the joint stage
+    ("table_4", "unet"): (None, False),
+    ("table_4", "sit"): (None, False),
 }
 
 

@@ -1,17 +1,21 @@
-"""Rows of ``r3dpa fit`` commands; each different training is run once, then tested.
+"""Rows of a table as trainings; a training that several rows share is planned once.
 
-A table is a folder with ``table.yaml`` and one YAML file per row, see ``conf/ablation``. The
-commands of a row follow those of the scale, and what the last one trains is tested::
+A table is a YAML file of rows, each a label, commands and the numbers that the paper printed::
 
-    label: vanilla alignment
-    published: {FRID: 7.23, JSD: 4.64}       # as printed in the paper, optional
-    commands:
-      vae: fit {vae_alignment} --model.init_args.rgb_weights {prior}
-      flow: fit {flow_matching} --model.init_args.init_from {vae}
+    caption: Effect of alignment.
+    rows:
+      vanilla:
+        label: vanilla alignment
+        published: {FRID: 7.23, JSD: 4.64}
+        commands:
+          vae: r3dpa fit vae_alignment --model.init_args.rgb_weights {prior}
+          flow: r3dpa fit flow_matching --model.init_args.init_from {vae}
+    better: [[joint, vanilla]]
 
-A name in braces stands for a word of the scale, which may use those before it, or the checkpoint of
-an earlier command, ``{seed}`` for the seed, ``{out}`` for the folder of the ablation, and
-``{here}`` for that of the scale.
+The last command of a row is tested. ``{vae}`` stands for the checkpoint that the command ``vae``
+makes. A scale is a YAML file with commands for all tables, ``prior`` here, and with what it adds to
+the commands of rows: ``options``, and settings as in a file after ``--config``, for all of them
+(``config``), for a stage (``stages``) and for a table (``tables``).
 """
 
 from __future__ import annotations
@@ -20,7 +24,7 @@ import hashlib
 import json
 import re
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,18 +35,20 @@ from r3dpa.io import sha256_of
 from r3dpa.metrics.results import PUBLISHED_SCALES
 
 _NAME = re.compile(r"{(\w+)}")
-_WEIGHTS = re.compile(r'"([^"{]+\.(?:pt|pth|ckpt|safetensors))"')
-_digest = cache(sha256_of)  # tables share weights
+_WEIGHTS = re.compile(r'"([^"]+\.(?:pt|pth|ckpt|safetensors))"')
+_SEEDS = ("seed_everything", "model.init_args.seed", "data.init_args.seed", "scorer.seed")
 _NOT_TRAINED = ("scorer", "run_dir", "ckpt_path")  # keys that do not change a training
+_PARTS_OF_SCALE = ("options", "config", "stages", "tables", "commands", "reference")
+_digest = cache(sha256_of)  # tables share weights
 
 
 class Stage(NamedTuple):
     """A training, shared by all rows in which it is the same.
 
-    ``name``, also of its run folder, is the experiment and a hash of the resolved ``config``, the
-    files of weights in it, the seed, and the stages ``before``. ``words`` are those after ``fit``,
-    and ``config`` what they amount to with seed 0. Of released weights or samples, which are given
-    instead, the config is empty and ``words`` is their path alone.
+    The name is the experiment, a hash of all that the training depends on, and the seed. ``words``
+    follow ``r3dpa fit``, ``config`` is what they amount to with seed 0, and ``before`` names the
+    stages that it starts from. Released weights or samples have their path alone as ``words``, and
+    no configuration.
     """
 
     name: str
@@ -50,17 +56,17 @@ class Stage(NamedTuple):
     words: list[str]
     config: dict[str, Any]
     before: tuple[str, ...]
-
-    @property
-    def on_scans(self) -> bool:
-        """Whether it trains on scans, not on images."""
-        return bool(self.config) and "grid_size" in self.config["data"]["init_args"]
+    on_scans: bool = True  # as all commands of rows
 
     @property
     def on_features(self) -> bool:
         """Whether the scans come with feature grids."""
-        data = self.config["data"]["init_args"] if self.on_scans else {}
-        return bool(data.get("extractor") or data.get("features_dir"))
+        return self.on_scans and bool(self.config["data"]["init_args"].get("extractor"))
+
+    @property
+    def checkpoint(self) -> Path:
+        """Last checkpoint of the training."""
+        return self.folder / "checkpoints" / "last.ckpt"
 
     @property
     def evaluation(self) -> Path:
@@ -108,137 +114,191 @@ class Plan(NamedTuple):
         return list({stage.name: stage for chain in self.chains for stage in chain}.values())
 
 
-class _Scale(NamedTuple):
-    out: Path
-    words: dict[str, str]
-    commands: dict[str, str]
-    resolve: Callable[[str], dict[str, Any]]
-
-    def stages(self, own: dict[str, str], seed: int, file: Path) -> list[Stage]:
-        """Stages of a row: its ``own`` commands, each after those that it needs."""
-        stages: dict[str, Stage] = {}
-        for name, text in (self.commands | own).items():
-            for word in reversed(self.words):  # one may use those before it
-                text = text.replace(f"{{{word}}}", self.words[word])
-            used = [n for n in _NAME.findall(text) if n not in ("seed", "out")]
-            place = f"{file}: commands.{name}"
-            if unknown := [n for n in used if n not in stages]:
-                known = f"nothing known before it; give one of {', '.join([*stages, *self.words])}"
-                raise ValueError(f"{place}: {{{unknown[0]}}} is {known}")
-            words = shlex.split(text.replace("{seed}", str(seed)))
-            if words[:1] != ["fit"] or not words[1:] or words[1].startswith("-"):
-                raise ValueError(f"{place}: {text!r} is no command `fit EXPERIMENT ...`")
-            content = json.dumps([words[1:], self.resolve(text.replace("{seed}", "0"))])
-            for n in used:
-                checkpoint = f"{{out}}/stages/{stages[n].name}/checkpoints/last.ckpt"
-                content = content.replace(f"{{{n}}}", checkpoint)
-            config = json.loads(content)[1]
-            trained = {key: value for key, value in config.items() if key not in _NOT_TRAINED}
-            paths = map(Path, _WEIGHTS.findall(json.dumps(trained)))
-            files = [_digest(path) for path in paths if path.is_file()]
-            hashed = json.dumps([trained, files, "{seed}" in text and seed], sort_keys=True)
-            title = f"{words[1]}-{hashlib.sha256(hashed.encode()).hexdigest()[:10]}"
-            words, config = json.loads(content.replace("{out}", str(self.out)))
-            before = tuple(stages[n].name for n in used)
-            stages[name] = Stage(title, self.out / "stages" / title, words, config, before)
-        needed = {stages[name].name for name in own}
-        for stage in reversed(stages.values()):
-            needed.update(stage.before if stage.name in needed else ())
-        return list({s.name: s for s in stages.values() if s.name in needed}.values())
+Resolve = Callable[[tuple[str, ...]], dict[str, Any]]
+"""Returns the whole configuration of the words after ``r3dpa``."""
 
 
 def make_plan(
-    folder: Path,
+    tables: Path,
     scale: Path,
     seeds: Sequence[int],
     out: Path,
-    resolve: Callable[[str], dict[str, Any]],
+    resolve: Resolve,
     rgb_weights: Path | None = None,
     released: Mapping[str, Path] | None = None,
 ) -> Plan:
-    """Plan of the table in a folder, or of all tables in folders below it.
+    """Plan the trainings of a table, or of all tables of a folder.
 
-    ``resolve`` gives the whole configuration of an ``r3dpa fit`` command, with ``{names}`` as they
-    are, and ``rgb_weights`` replace the command ``prior`` of the scale. ``released`` are
-    checkpoints to sample from, or folders of samples, in place of the trainings of a row, by its
-    name without the number. ``ValueError`` if there is no table or scale, a file is invalid, or a
-    seed is negative or occurs twice.
+    Args:
+        tables: YAML file of a table, with or without its ending, or a folder of tables.
+        scale: YAML file of a scale.
+        seeds: Plan each row for each of them.
+        out: Folder of the ablation.
+        resolve: Returns the configuration of a command.
+        rgb_weights: Weights in place of the command ``prior`` of the scale.
+        released: Checkpoint to sample from, or folder of samples, in place of the trainings of a
+            row, by its key.
+
+    Raises:
+        ValueError: If a file is missing or invalid, or a seed is negative or occurs twice.
     """
     if not seeds or len(set(seeds)) < len(seeds) or min(seeds) < 0:
         raise ValueError(f"--seeds must be different numbers from 0 on, got {list(seeds)}")
     if not scale.is_file():
         known = sorted(other.stem for other in scale.parent.glob("*.yaml"))
-        raise ValueError(f"{scale}: there is no such scale; give one of {', '.join(known) or '-'}")
-    about = _read(scale, ("about", "words"), ("commands", "reference"))
-    words = {"here": shlex.quote(str(scale.parent)), **about["words"]}
-    commands = about.get("commands", {})
-    if rgb_weights is not None:
-        if not rgb_weights.is_file():
-            raise ValueError(f"--rgb_weights {rgb_weights}: there is no such file")
-        words["prior"] = shlex.quote(str(rgb_weights))
-        commands.pop("prior", None)
-    given = _Scale(out, words, commands, cache(resolve))
-    single = (folder / "table.yaml").is_file()
-    folders = [folder] if single else sorted(path.parent for path in folder.glob("*/table.yaml"))
-    if not folders:
-        raise ValueError(f"{folder}: holds no table.yaml, nor does any folder in it")
+        raise ValueError(f"unknown scale {scale}; choose from {', '.join(known) or 'your files'}")
+    if rgb_weights is not None and not rgb_weights.is_file():
+        raise ValueError(f"--rgb_weights {rgb_weights} does not exist")
+    about = _read(scale, ("about",), _PARTS_OF_SCALE)
+    planner = _Planner(out, about, rgb_weights, cache(resolve))
     released = dict(released or {})
-    tables = [_table(path, given, seeds, released) for path in folders]
-    names = {_name_of(row.key) for table in tables for row in table.rows}
-    if unknown := [name for name in released if name not in names]:
-        raise ValueError(f"--released.{unknown[0]}: there is no such row; give one of {names}")
+    files = sorted(tables.glob("*.yaml")) if tables.is_dir() else [tables.with_suffix(".yaml")]
+    if not files or not files[0].is_file():
+        raise ValueError(f"{tables} is no table; give a YAML file, or a folder of them")
+    planned = [_plan_table(file, planner, seeds, released) for file in files]
+    keys = [row.key for table in planned for row in table.rows]
+    for key in released:
+        if key not in keys:
+            raise ValueError(f"--released.{key}: unknown row; choose from {', '.join(keys)}")
     options = shlex.split(about.get("reference", ""))
-    return Plan(out, scale.stem, about["about"], options, tuple(seeds), tables)
+    return Plan(out, scale.stem, about["about"], options, tuple(seeds), planned)
 
 
-def _table(
-    folder: Path, scale: _Scale, seeds: Sequence[int], released: Mapping[str, Path]
+def _plan_table(
+    file: Path, planner: _Planner, seeds: Sequence[int], released: Mapping[str, Path]
 ) -> Table:
-    path_of_table = folder / "table.yaml"
-    about = _read(path_of_table, ("caption",), ("better", "alike"))
+    about = _read(file, ("caption", "rows"), ("better", "alike"))
     rows: dict[str, Row] = {}
-    for file in sorted(set(folder.glob("*.yaml")) - {path_of_table}):
-        row = _read(file, ("label", "commands"), ("published",))
+    for key, row in about["rows"].items():
+        where = f"{file}: {key}"
+        _check_keys(where, row, ("label",), ("published", "commands"))
         published = row.get("published", {})
-        path, only_released = released.get(_name_of(file.stem)), row["commands"] == "released"
-        if only_released and path is None:
+        _check_keys(f"{where}: published", published, (), tuple(PUBLISHED_SCALES))
+        if key in released:
+            chain = [_released_stage(released[key], planner.out)]
+            stages = dict.fromkeys(seeds, chain)
+        elif "commands" in row:
+            chain = planner.plan_row(file.stem, row["commands"], where)
+            stages = {seed: _with_seed(chain, seed, planner.out) for seed in seeds}
+        else:  # exists only as released weights or samples
             continue
-        if not row["commands"] or not published.keys() <= PUBLISHED_SCALES.keys():
-            known = ", ".join(PUBLISHED_SCALES)
-            raise ValueError(f"{file}: has no command, or published names none of {known}")
-        if path is None:
-            stages = {seed: scale.stages(row["commands"], seed, file) for seed in seeds}
-        else:
-            stages = {seed: [_given(path, scale.out)] for seed in seeds}
-        rows[file.stem] = Row(file.stem, row["label"], published, stages)
+        rows[key] = Row(key, row["label"], published, stages)
     orders = [(name, *pair) for name in ("better", "alike") for pair in about.get(name, ())]
     for name, *pair in orders:
         if len(pair) != 2 or not rows.keys() >= set(pair):
-            raise ValueError(f"{path_of_table}: {name}: {pair} is no pair of {sorted(rows)}")
-    return Table(folder.name, about["caption"], list(rows.values()), orders)
+            raise ValueError(f"{file}: {name}: {pair} is no pair of {', '.join(rows)}")
+    return Table(file.stem, about["caption"], list(rows.values()), orders)
 
 
-def _name_of(key: str) -> str:
-    return re.sub(r"^\d+_", "", key)
+class _Planner:
+    """Makes the stages of rows from their commands and what the scale adds."""
+
+    def __init__(
+        self, out: Path, scale: dict[str, Any], prior: Path | None, resolve: Resolve
+    ) -> None:
+        self.out, self._scale, self._prior, self._resolve = out, scale, prior, resolve
+
+    def plan_row(self, table: str, commands: dict[str, str], where: str) -> list[Stage]:
+        """Stages of a row with seed 0, each after those that it needs."""
+        every = self._scale.get("commands", {}) | commands
+        places = {"out": self.out}
+        if self._prior is not None:
+            every.pop("prior", None)
+            places["prior"] = self._prior
+        needed = set(commands)
+        for name in reversed(every):
+            if name in needed:
+                needed.update(_NAME.findall(every[name]))
+        stages: dict[str, Stage] = {}
+        for name, command in every.items():
+            if name in needed:
+                place = f"{where}: {name}"
+                for used in _NAME.findall(command):
+                    if used not in places:
+                        known = ", ".join(list(every)[: list(every).index(name)])
+                        raise ValueError(f"{place}: unknown {{{used}}}; choose from {known}")
+                options = self._options(table, command, place, of_row=name in commands)
+                words = [_NAME.sub(lambda used: str(places[used[1]]), word) for word in options]
+                before = [stages[used].name for used in _NAME.findall(command) if used in stages]
+                stages[name] = self._stage(words, before, on_scans=name in commands)
+                places[name] = stages[name].checkpoint
+        return list({stage.name: stage for stage in stages.values()}.values())
+
+    def _options(self, table: str, command: str, where: str, of_row: bool) -> list[str]:
+        """Words after ``r3dpa fit``, with those that the scale adds to a command of a row."""
+        start = shlex.split(command)
+        if start[:2] != ["r3dpa", "fit"] or len(start) < 3 or start[2].startswith("-"):
+            raise ValueError(f"{where}: {command!r} is no command `r3dpa fit STAGE ...`")
+        _, _, experiment, *options = start
+        if not of_row:
+            return [experiment, *options]
+        added = shlex.split(self._scale.get("options", ""))
+        for settings in (self._scale, self._scale.get("tables", {}).get(table, {})):
+            for part in (settings.get("config"), settings.get("stages", {}).get(experiment)):
+                if part:
+                    added += ["--config", json.dumps(part)]
+        return [experiment, *added, *options]
+
+    def _stage(self, words: list[str], before: Iterable[str], on_scans: bool) -> Stage:
+        config = self._resolve(("fit", *words, *(_seed_words(0) if on_scans else ())))
+        trained = {key: value for key, value in config.items() if key not in _NOT_TRAINED}
+        # Wherever the folder is, and whether the stages in it are trained or not.
+        place = json.dumps(f"{self.out}/").removesuffix('"')
+        text = json.dumps(trained, sort_keys=True).replace(place, '"{out}/')
+        files = [_digest(path) for path in map(Path, _WEIGHTS.findall(text)) if path.is_file()]
+        digest = hashlib.sha256(json.dumps([text, files]).encode()).hexdigest()[:10]
+        name = f"{words[0]}-{digest}"
+        return Stage(name, self.out / "stages" / name, words, config, tuple(before), on_scans)
 
 
-def _given(path: Path, out: Path) -> Stage:
+def _with_seed(chain: Sequence[Stage], seed: int, out: Path) -> list[Stage]:
+    """The stages with another seed; those on images have none."""
+    names = {s.name: f"{s.name}-seed{seed}" if s.on_scans and seed else s.name for s in chain}
+    checkpoints = {
+        str(stage.checkpoint): str(out / "stages" / names[stage.name] / "checkpoints/last.ckpt")
+        for stage in chain
+    }
+    return [
+        stage._replace(
+            name=names[stage.name],
+            folder=out / "stages" / names[stage.name],
+            words=[checkpoints.get(word, word) for word in stage.words]
+            + (_seed_words(seed) if stage.on_scans else []),
+            before=tuple(names[name] for name in stage.before),
+        )
+        for stage in chain
+    ]
+
+
+def _seed_words(seed: int) -> list[str]:
+    return [word for key in _SEEDS for word in (f"--{key}", str(seed))]
+
+
+def _released_stage(path: Path, out: Path) -> Stage:
     """Stage of released weights or samples."""
     if not path.exists():
-        raise ValueError(f"--released {path}: there is no such file or folder")
+        raise ValueError(f"--released {path} does not exist")
     content = _digest(path) if path.is_file() else str(path.resolve())
     name = f"released-{hashlib.sha256(content.encode()).hexdigest()[:10]}"
-    return Stage(name, out / "stages" / name, [str(path)], {}, ())
+    return Stage(name, out / "stages" / name, [str(path)], {}, (), on_scans=False)
 
 
-def _read(path: Path, needed: Sequence[str], more: Sequence[str]) -> dict[str, Any]:
-    """A YAML file with these keys; a ``ValueError`` says what is wrong with it."""
+def _read(path: Path, needed: Sequence[str], optional: Sequence[str]) -> dict[str, Any]:
     try:
-        given: dict[str, Any] = dict(yaml.safe_load(path.read_text(encoding="utf-8")))
+        content: dict[str, Any] = dict(yaml.safe_load(path.read_text(encoding="utf-8")))
     except (yaml.YAMLError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: is no YAML of keys and values: {error}") from error
-    if not set(needed) <= given.keys() <= {*needed, *more}:
-        raise ValueError(
-            f"{path}: holds {[*given]}; needed are the keys {needed}, {more} may be given"
-        )
-    return given
+        raise ValueError(f"{path} is no YAML of keys and values: {error}") from error
+    _check_keys(str(path), content, needed, optional)
+    return content
+
+
+def _check_keys(
+    where: str, content: Mapping[str, Any], needed: Sequence[str], optional: Sequence[str]
+) -> None:
+    for key in needed:
+        if key not in content:
+            raise ValueError(f"{where}: missing {key!r}")
+    for key in content:
+        if key not in (*needed, *optional):
+            known = ", ".join((*needed, *optional))
+            raise ValueError(f"{where}: unknown {key!r}; choose from {known}")

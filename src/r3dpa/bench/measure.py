@@ -54,11 +54,6 @@ class Comparison:
         """Whether the interval of the A/A ratio contains 1; if not, ratios are no evidence."""
         return self.repeat.low <= 1 <= self.repeat.high
 
-    @property
-    def tolerance(self) -> float:
-        """Share by which equal times may differ here: the far end of the A/A interval."""
-        return max(self.repeat.high, 1 / self.repeat.low, 1.0) - 1
-
     def over_first(self, name: str) -> Ratio:
         """Time of a case over that of the first."""
         return Ratio.of(self.seconds[name], next(iter(self.seconds.values())))
@@ -69,21 +64,21 @@ def compare(
     rounds: int,
     keep: Callable[[int, Callable[[], list[float]]], list[float]] = lambda number, run: run(),
 ) -> Comparison:
-    """Runs each case once a round, the first one twice, after a warm-up round.
+    """Run each case once per round, the first one twice, after a warm-up round.
 
     Every second round runs backwards, so that drifts of the machine affect all cases alike.
 
     Args:
         cases: Functions that return the seconds that they took, see :func:`timed`.
         rounds: At least 1.
-        keep: Returns the measurements of a round by number from ``run``, or from an earlier run.
+        keep: Returns the seconds of a round by its number, from ``run`` or from an earlier run.
     """
-    every = [*cases, next(iter(cases))]
+    names = [*cases, next(iter(cases))]
 
     def run(number: int) -> list[float]:
-        order = range(len(every))
-        found = {i: cases[every[i]]() for i in (reversed(order) if number % 2 else order)}
-        return [found[place] for place in order]
+        order = range(len(names))
+        seconds = {i: cases[names[i]]() for i in (reversed(order) if number % 2 else order)}
+        return [seconds[i] for i in order]
 
     run(0)
     numbers = tqdm(range(1, rounds + 1), "timing", unit="round", disable=None)
@@ -93,9 +88,9 @@ def compare(
 
 
 def timed(function: Callable[[], object], device: torch.device = _CPU) -> Callable[[], float]:
-    """The function as a case of :func:`compare`; on a GPU until the device has finished.
+    """Make the function a case of :func:`compare`; on a GPU it ends when the device has finished.
 
-    With a single CPU thread processor time counts, which other processes hardly change.
+    With a single CPU thread the processor time counts, which other processes hardly change.
     """
 
     def run() -> float:
@@ -111,14 +106,14 @@ def timed(function: Callable[[], object], device: torch.device = _CPU) -> Callab
 
 
 def flop_of(function: Callable[[], object]) -> int:
-    """FLOP of products, convolutions and attention (run as products) of one call, not compiled."""
+    """Count the FLOP of products, convolutions and attention of one call, not compiled."""
     with sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as counter:
         function()
     return counter.get_total_flops()
 
 
 def peak_bytes(device: torch.device) -> int:
-    """Peak memory so far: of tensors on a GPU, of this whole process on a CPU."""
+    """Return the peak memory so far: of tensors on a GPU, of this whole process on a CPU."""
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device)
     status = Path("/proc/self/status")
@@ -129,6 +124,6 @@ def peak_bytes(device: torch.device) -> int:
 
 
 def synchronise(device: torch.device) -> None:
-    """Waits until a GPU has finished all work."""
+    """Wait until a GPU has finished all work."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)

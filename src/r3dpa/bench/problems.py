@@ -31,7 +31,7 @@ _EXACT_PRODUCTS = partial(torch.backends.cudnn.flags, enabled=True, allow_tf32=F
 class GaussianMixture:
     """Data distribution ``sum_k weight_k N(mean_k, std^2 I)`` and its velocity on the linear path.
 
-    ``means`` are ``(K, D)``, ``std`` is that of every Gaussian in every direction, and the
+    ``means`` are ``(K, D)``, all Gaussians have the same ``std`` in every direction, and the
     ``weights`` ``(K,)`` need not sum to 1.
     """
 
@@ -61,12 +61,12 @@ class GaussianMixture:
 
 
 def toy_mixture(seed: int = 0) -> GaussianMixture:
-    """128 equally likely Gaussians in 64 dimensions, float64, standard deviation 0.2.
+    """Return 128 equally likely Gaussians in 64 dimensions, float64, standard deviation 0.2.
 
-    The means are standard Gaussian in a random plane of 4 dimensions, as data lie near few
-    dimensions of their space. There they crowd: late on its way a path still has to decide between
-    neighbours, which is what makes solvers err (apart from each other, means in all 64 dimensions
-    would be decided between at once near the noise).
+    The means are standard Gaussian in a random subspace of 4 dimensions, as data lie near few
+    dimensions of their space. There they are close together, so that a path decides between
+    neighbours late, which is where solvers err. Means in all 64 dimensions would be far apart, and
+    decided between at once near the noise.
     """
     generator = torch.Generator().manual_seed(seed)
     places = torch.randn(128, 4, generator=generator, dtype=torch.float64)
@@ -104,9 +104,9 @@ class Solved(NamedTuple):
 
 
 class MixtureProblem:
-    """A mixture of Gaussians with its exact velocity; float64, whatever the precision of a setting.
+    """A mixture of Gaussians with its exact velocity, in float64 at every setting.
 
-    ``num`` samples are solved together, since one generator draws all noise, and ``batch`` timed.
+    ``num`` samples are solved together, since one generator draws all noise; ``batch`` are timed.
     """
 
     def __init__(self, mixture: GaussianMixture, num: int, batch: int = 256) -> None:
@@ -137,9 +137,9 @@ class MixtureProblem:
 
 
 class ModelProblem:
-    """Networks of a checkpoint without guidance, whose flow is the one that solvers are judged by.
+    """Networks of a checkpoint, without guidance: solvers are judged by the plain flow.
 
-    Where nothing is timed ``batch`` scenes are solved together.
+    Where nothing is timed, ``batch`` scenes are solved together.
     """
 
     def __init__(self, checkpoint: Checkpoint, device: str, batch: int) -> None:
@@ -162,8 +162,8 @@ class ModelProblem:
     def solve(self, setting: Setting, indices: range) -> Solved:
         """Scenes of these indices as the generator draws them."""
         with _EXACT_PRODUCTS():
-            found = self._generator(setting).generate(indices, _SEED)
-        return Solved(found.latents.cpu(), found.range_m.cpu())
+            scenes = self._generator(setting).generate(indices, _SEED)
+        return Solved(scenes.latents.cpu(), scenes.range_m.cpu())
 
     @torch.inference_mode()
     def converged(self, steps: int, indices: range) -> Solved:
@@ -171,9 +171,9 @@ class ModelProblem:
         generator = self._generators["fp32", "full"]
         noise = generator.noise(indices, _SEED)
         with _EXACT_PRODUCTS():
-            found = heun(generator.velocity, noise.double(), ode_times(steps))
-            range_m = generator.decode(found.float())
-        return Solved(found.cpu(), range_m.cpu())
+            latents = heun(generator.velocity, noise.double(), ode_times(steps))
+            range_m = generator.decode(latents.float())
+        return Solved(latents.cpu(), range_m.cpu())
 
     def case(self, setting: Setting) -> Callable[[], float]:
         """Sampling and decoding a batch as a case to be timed, times per scene."""
@@ -186,7 +186,9 @@ class ModelProblem:
         counts = []
         for steps in (1, 2):
             generator = self._generator(Setting(SamplerConfig("euler", steps), decoder=decoder))
-            generator.generate([0], _SEED)  # what is computed once for a schedule does not count
+            generator.generate(
+                [0], _SEED
+            )  # computes what a schedule needs once, which is not counted
             counts.append(flop_of(partial(generator.generate, [0], _SEED)))
         each = float(counts[1] - counts[0])
         return each, counts[0] - each

@@ -46,7 +46,7 @@ STAGES = ("vae_alignment", "joint", "flow_matching")
 
 @dataclass(frozen=True)
 class StepSettings:
-    """Settings of the measured steps; ``quick`` takes the networks of the demo.
+    """Settings of the measured steps; ``quick`` measures the networks of the demo.
 
     The first of ``steps`` pays for warm-up and runs before the optimiser has moments: the peak of a
     long run takes two.
@@ -63,8 +63,8 @@ class StepSettings:
 class StageCost:
     """Cost of training one stage.
 
-    ``step_seconds`` hold losses, backward, clipping, optimiser and averages, not loading; ``flop``
-    is of one step; ``peak_host_bytes`` of the whole process, ``peak_gpu_bytes`` of tensors.
+    ``step_seconds`` are times of losses, backward, clipping, optimiser and EMA, without loading;
+    ``flop`` is of one step, ``peak_host_bytes`` of the process, ``peak_gpu_bytes`` of tensors.
     """
 
     stage: str
@@ -98,11 +98,18 @@ def training(
     settings: StepSettings = StepSettings(),
     out: Path | None = None,
 ) -> str:
-    """Trains each stage for a few steps on simulated scans; returns a table of its cost.
+    """Train each stage for a few steps on simulated scans; return a table of its cost.
 
-    Each stage runs in a fresh process, so that no peak contains what another stage left behind;
-    ``RuntimeError`` if it was killed, as happens when memory runs out. Stage ``joint`` is
-    ``<conf>/experiment/joint.yaml``, and the JSON file ``out`` gets the figures without rounding.
+    Each stage runs in a fresh process, so that no peak contains what another stage left behind.
+
+    Args:
+        conf: Folder of the configurations: stage ``joint`` is ``<conf>/experiment/joint.yaml``.
+        stages: Stages to measure.
+        settings: Size of the measurement.
+        out: JSON file for the figures without rounding.
+
+    Raises:
+        RuntimeError: If a process was killed, as happens when memory runs out.
     """
     settings = replace(settings, device=cast(Any, usable_device(settings.device)))
     files = {stage: _experiments(conf, stage, settings.quick) for stage in stages}
@@ -127,13 +134,12 @@ def training(
 
 
 def _experiments(conf: Path, stage: str, quick: bool) -> list[Path]:
-    paths = [conf / "experiment" / f"{name}.yaml" for name in [stage, f"{stage}_demo"][: 1 + quick]]
+    paths = [conf / "experiment" / f"{stage}.yaml"]
+    if quick:
+        paths.append(conf / "demo" / f"{stage}.yaml")
     for path in paths:
         if not path.is_file():
-            raise ValueError(
-                f"there is no experiment {path}; name one of {', '.join(STAGES)}, and give conf "
-                "the folder of the configurations"
-            )
+            raise ValueError(f"{path} does not exist; choose stages from {', '.join(STAGES)}")
     return paths
 
 
@@ -153,7 +159,7 @@ def _in_new_process(
 
 
 def _silence_lightning() -> None:
-    """Hides hints about loaders and loggers, which do not apply to a benchmark."""
+    """Hide hints about loaders and loggers, which do not apply to a benchmark."""
     warnings.filterwarnings("ignore", module="lightning")
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
 
@@ -184,9 +190,9 @@ def _measure(stage: str, files: list[Path], folder: Path, settings: StepSettings
 
 
 def _build(files: list[Path], fresh_vae: Path) -> GenerativeModule:
-    """The module of an experiment, to start from a VAE with random weights.
+    """Build the module of an experiment, with a VAE of random weights as the stage before.
 
-    Stage flow_matching refuses to start without one; random weights cost the same.
+    Stage flow_matching refuses to start without one, and random weights cost the same.
     """
     parser = LightningArgumentParser(exit_on_error=False)
     parser.add_subclass_arguments(GenerativeModule, "model")
@@ -232,13 +238,13 @@ class _StepMeter(L.Callback):
         self._counter = FlopCounterMode(display=False)
 
     def on_train_batch_start(self, trainer: L.Trainer, *args: Any) -> None:
-        """Starts clock or counter."""
+        """Start the clock, or the counter in the last step."""
         if trainer.global_step == self.steps:
             self._counting.enter_context(self._counter)
         self._start = self._now(trainer)
 
     def on_train_batch_end(self, trainer: L.Trainer, *args: Any) -> None:
-        """Stops it, after optimiser and averages."""
+        """Stop it, after optimiser and EMA."""
         device = trainer.strategy.root_device
         if trainer.global_step > self.steps:
             self._counting.close()

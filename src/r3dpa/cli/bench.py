@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 import warnings
+from collections.abc import Sequence
 from contextlib import redirect_stdout
 from io import StringIO
 from pathlib import Path
@@ -62,7 +63,7 @@ def sampling(
     The same command completes an interrupted run.
 
     Args:
-        out: Folder for tables, pictures and ``quality.json``.
+        out: Folder for table, picture and figures.
         ckpt: Checkpoint of stage joint or flow_matching, such as ``r3dpa-s``; default: only a
             mixture of Gaussians whose velocity is exact.
         quick: Few scenes, steps and rounds: minutes on a CPU.
@@ -106,11 +107,11 @@ def ablate(
     interrupted run. A row that fails does not stop the others; the exit status is then 1.
 
     Args:
-        tables: Folder of a table, such as ``conf/ablation/table_3`` (also found in the package), or
-            of several: ``conf/ablation``.
+        tables: A table, such as ``conf/ablation/table_3`` (also found in the package), or a folder
+            of tables: ``conf/ablation``.
         scale: ``demo`` for CPU cores, ``small`` for half an hour of one GPU, ``paper``; or a YAML
             file of that kind.
-        seeds: Every row is trained and tested for each, such as ``0 1 2``.
+        seeds: Train and test every row for each, such as ``0 1 2``.
         out: Folder for everything; default: ``runs/ablation/<scale>``.
         jobs: Trainings and tests at a time; they share the cores, and all use the first GPU.
         rgb_weights: RGB-pretrained SiT, official ``.pt`` or ours, instead of pretraining one.
@@ -121,20 +122,19 @@ def ablate(
         budget_only: Print number and length of the trainings, and start nothing.
     """
     from r3dpa import ablation
-    from r3dpa.cli.stages import conf_folder
+    from r3dpa.cli.stages import shipped
     from r3dpa.io import only_writer
 
-    if not tables.is_dir() and (conf_folder().parent / tables).is_dir():
-        tables = conf_folder().parent / tables
-    if not tables.is_dir():
-        raise ValueError(f"{tables}: is no folder; give that of a table, or of several")
+    tables = shipped(tables) if tables.is_dir() or tables.suffix else shipped(f"{tables}.yaml")
     scale_file = Path(scale)
     if scale_file.suffix not in (".yaml", ".yml"):
-        folder = tables if (tables / "scale").is_dir() else tables.parent
-        scale_file = folder / "scale" / f"{scale}.yaml"
+        parent = tables if tables.is_dir() else tables.parent
+        scale_file = parent / "scale" / f"{scale}.yaml"
     folder = out or Path("runs/ablation") / scale_file.stem
     check_folder(folder)
-    plan = ablation.make_plan(tables, scale_file, seeds, folder, _resolved, rgb_weights, released)
+    plan = ablation.make_plan(
+        tables, scale_file, seeds, folder, resolve_config, rgb_weights, released
+    )
     _say(ablation.budget_of(plan))
     if budget_only:
         return
@@ -153,16 +153,17 @@ def ablate(
         sys.exit(1)
 
 
-def _resolved(command: str) -> dict[str, Any]:
+def resolve_config(words: Sequence[str]) -> dict[str, Any]:
+    """Configuration that a command line of a stage amounts to."""
     from r3dpa.cli.stages import run
 
     with redirect_stdout(StringIO()) as printed, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # on words that are not those of the process
+        warnings.simplefilter("ignore")  # Lightning: the words are not those of the process
         try:
-            run([*shlex.split(command), "--print_config"])
+            run([*words, "--print_config"])
         except SystemExit as ended:
             if ended.code:
-                raise ValueError(f"the above is said of: r3dpa {command}") from None
+                raise ValueError(f"invalid command: r3dpa {shlex.join(words)}") from None
     return dict(yaml.safe_load(printed.getvalue()))
 
 

@@ -11,7 +11,7 @@ from typing import Any, cast
 
 from lightning import Trainer
 
-from r3dpa.cli.stages import StageParser, ignore_harmless_warnings
+from r3dpa.cli.stages import StageParser, ignore_harmless_warnings, shipped
 from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.data.feature_grids import features_lock, plan
 from r3dpa.data.scans import Scan
@@ -111,7 +111,7 @@ def with_data_class(words: Sequence[str]) -> list[str]:
         elif source.is_dir():
             found += ["--data=r3dpa.data.LidarDataModule", f"--data.init_args.scans={value}"]
         elif source.suffix in (".yaml", ".yml"):
-            found += ["--config", value]
+            found += ["--config", str(shipped(value))]
         elif len(source.parts) > 1:
             raise ValueError(f"--data {value}: is no folder of scans and no data YAML")
         else:  # a class

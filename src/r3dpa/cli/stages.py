@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import uuid
 import warnings
+from collections.abc import Sequence
 from contextlib import nullcontext
 from importlib.resources import files
 from pathlib import Path
@@ -52,6 +53,26 @@ def conf_folder() -> Path:
     return Path(str(files("r3dpa") / "conf"))
 
 
+def shipped(path: str | Path) -> Path:
+    """The file, or the one of the package where ``conf/...`` does not exist here."""
+    of_package = conf_folder().parent / path
+    is_shipped = not Path(path).exists() and of_package.exists()
+    return of_package if is_shipped else Path(path)
+
+
+def _with_shipped(words: Sequence[str]) -> list[str]:
+    """The words with the files after ``--config`` as :func:`shipped` finds them."""
+    found: list[str] = []
+    for word in words:
+        name, _, value = word.partition("=")
+        if name == "--config" and value.startswith("conf/"):
+            word = f"--config={shipped(value)}"
+        elif found[-1:] == ["--config"] and word.startswith("conf/"):
+            word = str(shipped(word))
+        found.append(word)
+    return found
+
+
 class _RecordConfig(SaveConfigCallback):
     """Writes the configuration of a training to ``run_dir`` and to wandb."""
 
@@ -90,6 +111,7 @@ class StageCLI(LightningCLI):
 
     def __init__(self, args: list[str]) -> None:
         self._command = args[0]
+        self._ckpt_step: int | None = None
         super().__init__(
             LightningModule,
             LightningDataModule,
@@ -127,7 +149,7 @@ class StageCLI(LightningCLI):
         if config.get("ckpt_path") == "last":
             config.ckpt_path = _newest(Path(config.run_dir))
         if config.get("ckpt_path"):
-            read_checkpoint(config.ckpt_path)
+            self._ckpt_step = read_checkpoint(config.ckpt_path).step
             if Path(config.ckpt_path).suffix != ".ckpt":  # released or exported
                 raise ValueError(
                     f"--ckpt_path {config.ckpt_path} is no .ckpt of a run; scenes of other files "
@@ -163,7 +185,12 @@ class StageCLI(LightningCLI):
         if self._ckpt_path is None:
             raise ValueError(f"{self.subcommand} needs trained weights: give --ckpt_path")
 
-    before_validate = before_test = before_predict
+    def before_validate(self) -> None:
+        """Refuses to use random weights, and logs at the step of the checkpoint, not at 0."""
+        self.before_predict()
+        self.trainer.fit_loop.epoch_loop._batches_that_stepped = self._ckpt_step or 0
+
+    before_test = before_validate
 
     @property
     def _ckpt_path(self) -> str | None:
@@ -221,9 +248,9 @@ def _with_preset(words: list[str]) -> list[str]:
         if name not in known:
             raise ValueError(f"there is no {kind} {name!r}; give one of {', '.join(known)}")
     data = "dead_leaves" if demo and stage in ("image_vae", "rgb_pretraining") else preset
-    names = ["trainer", *(["trainer_demo"] if demo else []), f"data/{data}", stages[stage]]
-    if demo and f"{stage}_demo" in stages:
-        names.append(stages[f"{stage}_demo"])
+    names = ["trainer", *(["demo/trainer"] if demo else []), f"data/{data}", stages[stage]]
+    if demo and (conf / "demo" / f"{stage}.yaml").is_file():
+        names.append(f"demo/{stage}")
     configs = [word for name in names for word in ("--config", str(conf / f"{name}.yaml"))]
     return [*configs, "--run_dir", f"runs/{preset}/{stage}", *rest]
 
@@ -231,4 +258,4 @@ def _with_preset(words: list[str]) -> list[str]:
 def run(args: list[str]) -> None:
     """Runs a stage command: ``["fit", "--config", "x.yaml"]``, ``["fit", "joint"]``."""
     ignore_harmless_warnings()
-    StageCLI([args[0], *_with_preset(args[1:])])
+    StageCLI([args[0], *_with_shipped(_with_preset(args[1:]))])

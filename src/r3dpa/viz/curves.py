@@ -75,12 +75,16 @@ def read_metrics(path: str | Path) -> dict[str, Series]:
 def read_curves(run: Path) -> dict[str, Series]:
     """Quantities of a training by step, from the ``version_*/metrics.csv`` of each start.
 
-    Where a start repeats steps of an earlier one its values count.
+    Where a start repeats steps of an earlier one its values count. Files of ``r3dpa validate``,
+    which have no training losses, are left out.
     """
     curves: dict[str, dict[float, float]] = {}
     paths = run.glob("version_*/metrics.csv")
     for path in sorted(paths, key=lambda path: path.stat().st_mtime):
-        for name, (steps, values) in read_metrics(path).items():
+        series = read_metrics(path)
+        if series and all(name.startswith("val/") for name in series):
+            continue
+        for name, (steps, values) in series.items():
             curves.setdefault(name, {}).update(zip(steps, values, strict=True))
     ordered = {name: sorted(curve.items()) for name, curve in curves.items()}
     return {name: ([s for s, _ in c], [v for _, v in c]) for name, c in ordered.items()}
@@ -177,7 +181,7 @@ def pareto_figure(
         Line2D([], [], color=colour, marker=marker, linestyle="none", label=solver)
         for solver, (colour, marker) in styles.items()
     ]
-    entries.append(Line2D([], [], color="#222222", label="Pareto front (95 %)"))
+    entries.append(Line2D([], [], color="#222222", label="Pareto front"))
     for style, (name, value) in zip(("--", "-.", ":"), levels.items(), strict=False):
         line = axes.axhline(value, color="#555555", linewidth=1.0, linestyle=style, zorder=1)
         line.set_label(f"{name}: {value:.3g}")

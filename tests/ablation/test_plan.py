@@ -1,0 +1,136 @@
+"""Plans of ablations: what rows share, what a name depends on, and what is refused."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+from resolved_fits import resolved
+
+from r3dpa.ablation import budget_of, make_plan
+from r3dpa.ablation.runs import plan_jobs
+from r3dpa.cli.bench import resolve_config
+
+TABLES = Path(__file__).resolve().parents[2] / "conf" / "ablation"
+SEEDS = ("seed_everything", "model.init_args.seed", "data.init_args.seed", "scorer.seed")
+
+
+def plan_of(scale, seeds=(0,), tables=TABLES, **more):
+    scale = TABLES / "scale" / f"{scale}.yaml" if isinstance(scale, str) else scale
+    return make_plan(tables, scale, seeds, Path("out"), resolved, **more)
+
+
+def rows_of(plan):
+    return {(table.name, row.key): row for table in plan.tables for row in table.rows}
+
+
+def names_of(stages):
+    return [stage.name for stage in stages]
+
+
+def test_trainings_that_rows_share_are_planned_once():
+    """Table II ends as table III begins; every stage comes after those that it starts from."""
+    plan = plan_of("demo")
+    rows = rows_of(plan)
+    last, first = rows["table_2", "aligned"], rows["table_3", "none"]
+    assert names_of(last.stages[0]) == names_of(first.stages[0])
+    names = names_of(plan.stages)
+    assert len(set(names)) == len(names) < sum(map(len, plan.chains))
+    for place, stage in enumerate(plan.stages):
+        assert set(stage.before) <= set(names[:place])
+    assert all(len(row.published) == 6 for row in rows.values())
+
+
+def test_trainings_of_table_1_are_those_of_the_paper_and_the_others_its_ablations():
+    plan = plan_of("paper")
+    rows = rows_of(plan)
+    steps = {
+        key: {stage.words[0]: stage.config["trainer"]["max_steps"] for stage in row.stages[0]}
+        for key, row in rows.items()
+    }
+    ours = {"rgb_pretraining": 1_000_000, "vae_alignment": 800_000, "joint": 1_000_000}
+    assert steps["table_1", "r3dpa"] == ours
+    assert steps["table_3", "joint"] == ours | {"vae_alignment": 400_000, "joint": 400_000}
+    assert steps["table_1", "lidm_ape"] == {"lidm_first_stage": 40_000, "lidm": 200_000}
+    assert "1 vae_alignment of 800000 steps" in budget_of(plan)
+    sit, unet = (rows["table_4", key].stages[0][-1] for key in ("sit", "unet"))
+    for stage, network in ((sit, "SiT"), (unet, "UNet")):
+        assert stage.config["model"]["init_args"]["sit"]["class_path"] == f"r3dpa.nn.{network}"
+
+
+def test_a_second_seed_repeats_all_but_the_prior():
+    one, two = plan_of("demo"), plan_of("demo", (0, 1))
+    prior = [stage for stage in one.stages if not stage.on_scans]
+    assert len(two.stages) == 2 * len(one.stages) - len(prior)
+    assert set(names_of(one.stages)) < set(names_of(two.stages))
+    for seed in (0, 1):
+        vae, joint = rows_of(two)["table_3", "joint"].stages[seed][-2:]
+        assert joint.words[-8::2] == [f"--{key}" for key in SEEDS]
+        assert joint.words[-7::2] == [str(seed)] * 4
+        assert str(vae.checkpoint) in joint.words
+
+
+def test_the_name_depends_on_given_weights_which_replace_the_prior(tmp_path):
+    names = []
+    for content in ("one", "other"):
+        weights = tmp_path / f"{content}.pt"
+        weights.write_text(content)
+        rows = rows_of(plan_of("demo", tables=TABLES / "table_2", rgb_weights=weights))
+        assert str(weights) in rows["table_2", "rgb"].stages[0][-1].words
+        names.append({key: set(names_of(row.stages[0])) for (_, key), row in rows.items()})
+    assert names[0]["scratch"] == names[1]["scratch"]
+    assert not names[0]["aligned"] & names[1]["aligned"]
+
+
+def test_the_name_depends_on_the_training_not_on_the_test_or_the_folder(tmp_path):
+    scale = yaml.safe_load((TABLES / "scale" / "demo.yaml").read_text())
+    usual = names_of(plan_of("demo", tables=TABLES / "table_4").stages)
+    for section, key, out in (("scorer", "num_scenes", "a"), ("trainer", "max_steps", "b/c")):
+        scale["config"][section][key] += 1
+        (tmp_path / "demo.yaml").write_text(yaml.safe_dump(scale))
+        file, out = tmp_path / "demo.yaml", tmp_path / out
+        plan = make_plan(TABLES / "table_4.yaml", file, (0,), out, resolve_config)
+        assert (names_of(plan.stages) == usual) == (section == "scorer")
+
+
+def test_released_files_stand_for_trainings(tmp_path):
+    weights, samples = tmp_path / "r2dm.pth", tmp_path / "samples"
+    weights.write_bytes(b"weights")
+    samples.mkdir()
+    released = {"r2dm": weights, "ultralidar": samples}
+    scale = TABLES / "scale" / "demo.yaml"
+    plan = make_plan(TABLES / "table_1", scale, (0,), tmp_path, resolved, released=released)
+    rows = rows_of(plan)
+    assert next(key for _, key in rows) == "ultralidar"
+    assert not any(stage.words[0] == "r2dm" for stage in plan.stages)
+    jobs = {job.name: job for job in plan_jobs(plan)}
+    (stage,) = rows["table_1", "r2dm"].stages[0]
+    sampled, test = jobs[stage.name], jobs[f"test of {stage.name}"]
+    assert sampled.words[:3] == ["sample", "--ckpt", str(weights)]
+    assert test.words[:3] == ["evaluate", "--samples", sampled.words[4]]
+    assert (test.needs, test.makes) == ((stage.name, "reference"), stage.evaluation)
+    (stage,) = rows["table_1", "ultralidar"].stages[0]
+    assert jobs[f"test of {stage.name}"].words[2] == str(samples)
+    assert stage.name not in jobs
+
+
+ROW = {"label": "x", "commands": {"a": "r3dpa fit joint"}}
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ({"commands": {}}, r"t\.yaml: b: .*'label'"),
+        ({"label": "x", "colour": 1}, r"t\.yaml: b: .*'colour'"),
+        (
+            ROW | {"commands": {"a": "r3dpa fit x {fly}"}},
+            "unknown {fly}; choose from image_vae, prior",
+        ),
+        (ROW | {"commands": {"a": "sample x"}}, "is no command `r3dpa fit STAGE"),
+        (ROW | {"published": {"FID": 1.0}}, "unknown 'FID'; choose from FRID"),
+    ],
+)
+def test_a_wrong_row_is_named(row, message, tmp_path):
+    content = {"caption": "c", "rows": {"a": ROW, "b": row}}
+    (tmp_path / "t.yaml").write_text(yaml.safe_dump(content))
+    with pytest.raises(ValueError, match=message):
+        plan_of("demo", tables=tmp_path / "t.yaml")

@@ -1,0 +1,95 @@
+"""Tables of ablations: means over seeds, orders of the paper, and the recorded tables again."""
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from tiny_evaluations import evaluation
+
+from r3dpa.ablation import write_table
+from r3dpa.ablation.plan import Plan, Row, Stage, Table
+from r3dpa.ablation.tables import order_results
+from r3dpa.metrics.results import Evaluation, MetricResult
+from r3dpa.metrics.seeds import mean_of_seeds
+
+RECORDED = Path(__file__).resolve().parents[2] / "notebooks" / "results" / "ablation_demo"
+
+
+def test_a_mean_over_seeds_keeps_notes_and_bad_samples():
+    few = evaluation(JSD=2.0)
+    few = replace(few, rows=(replace(few.rows[0], note="few scenes"),))
+    few.about["extra"]["bad_samples"] = ["7"]
+    mean = mean_of_seeds("row", [evaluation(JSD=1.0, MMD=2.0), few])
+    assert mean.row("JSD").note == "few scenes"
+    assert mean.row("MMD") is None
+    assert mean.bad_samples == ["7"]
+    assert mean_of_seeds("row", [evaluation(JSD=1.0)]).row("JSD").interval == (0.9, 1.1)
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs", "better", "alike"),
+    [
+        ((1.0,), (2.0,), "yes", "no"),
+        ((2.0,), (1.0,), "no", "no"),
+        ((1.0,), (1.1,), "unclear", "unclear"),  # half widths of 0.1 each
+        ((20.0,), (20.1,), "unclear", "yes"),
+        ((1.0, 1.01), (2.0, 2.0), "yes", "no"),
+        ((1.0, 1.9), (2.0, 2.0), "unclear", "unclear"),  # both better, by unlike amounts
+        ((3.0, 5.0), (3.01, 5.01), "unclear", "yes"),  # in pairs: seeds differ more than rows
+    ],
+)
+def test_an_order_holds_if_the_interval_lies_inside_the_claim(ours, theirs, better, alike):
+    rows = [Row(key, key, {}, {}) for key in "ab"]
+    table = Table("t", "", rows, [("better", "a", "b"), ("alike", "a", "b")])
+    results = {
+        key: {seed: evaluation(JSD=value) for seed, value in enumerate(values)}
+        for key, values in (("a", ours), ("b", theirs))
+    }
+    orders = order_results(table, results, {"JSD": True})
+    assert [order.holds for order in orders] == [better, alike]
+
+
+@pytest.mark.parametrize("name", ["table_2", "table_3", "table_4"])
+def test_recorded_tables_are_computed_again(name, tmp_path):
+    """From the numbers of each seed: means, intervals, paired differences and what they say."""
+    plan, stored = recorded(name, tmp_path)
+    write_table(plan, plan.tables[0], {})
+    content = json.loads((tmp_path / f"{name}.json").read_text())
+    for key in ("caption", "scale", "about", "rows", "orders"):
+        assert content[key] == stored[key], key
+    old, new = ((folder / f"{name}.md").read_text() for folder in (RECORDED, tmp_path))
+    lines = [line for line in old.splitlines() if "Paper: " in line or "Scale" in line]
+    assert [line for line in lines if line not in new] == []
+    assert "against KITTI-360, train-val (MMD: val-only)" in new
+    assert r"\bottomrule" in (tmp_path / f"{name}.tex").read_text()
+    means = []
+    for folder in (RECORDED, tmp_path):
+        with (folder / f"{name}.csv").open(newline="") as file:
+            keys = ("label", "metric", "value", "low", "high")
+            means.append([[line[key] for key in keys] for line in csv.DictReader(file)])
+    assert means[0] == means[1]
+
+
+def recorded(name, out):
+    """Plan of a recorded table, with its evaluations in their folders."""
+    stored = json.loads((RECORDED / f"{name}.json").read_text())
+    rows = []
+    for row in stored["rows"]:
+        chains = {}
+        for seed, names in row["stages"].items():
+            chain = [Stage(stage, out / stage, [], {}, ()) for stage in names]
+            results = [
+                MetricResult(metric, value, row["intervals"][seed][metric])
+                for metric, value in row["values"][seed].items()
+            ]
+            Evaluation(row["label"], results, evaluation().about).save(chain[-1].evaluation)
+            chains[int(seed)] = chain
+        rows.append(Row(row["key"], row["label"], row["published"], chains))
+    orders = {
+        (order["claim"].replace("worse", "better"), order["first"], order["second"]): None
+        for order in stored["orders"]
+    }
+    table = Table(name, stored["caption"], rows, list(orders))
+    return Plan(out, stored["scale"], stored["about"], [], (0, 1, 2), [table]), stored
