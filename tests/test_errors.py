@@ -65,7 +65,7 @@ def test_a_corrupted_scan_is_named_while_grids_are_made(folder, refused):
 def test_a_folder_without_a_split_of_kitti360(tmp_path, refused):
     kitti = ["--data.class_path", "r3dpa.data.KITTI360DataModule"]
     message = refused("joint", *kitti, "--data.init_args.root", tmp_path)
-    assert f"No scan of the train split in {tmp_path}" in message
+    assert f"no scan of the train split in {tmp_path}" in message
     assert "r3dpa data check" in message
 
 

@@ -97,7 +97,8 @@ def simulate(
     Each scan depends only on the request and its number: the files are the same bytes for any
     number of workers. Files are written atomically, so an interrupted call is completed by the
     same call, which also deletes the temporary files of killed runs. A call for more scans adds
-    them and keeps the existing ones. A second call for the same folder waits for the first.
+    them and keeps the existing ones; one for fewer uses the first ones of each drive. A second call
+    for the same folder waits for the first.
 
     Args:
         out: Root folder of the data set; made if missing.
@@ -119,7 +120,7 @@ def simulate(
 
     Raises:
         ValueError: If a value is out of range, an effect or a drive is unknown, a drive is named
-            twice, or ``out`` holds other data, more scans, or the data set of another request.
+            twice, or ``out`` holds other data or the data set of another request.
         ChildProcessError: If a worker was killed.
     """
     if workers < 1:
@@ -140,17 +141,19 @@ def simulate(
         "effects": check_switches(effects or {}),
         "weather": None if weather is None else weather_to_dict(weather),
     }
-    _check_folder(out, request)
+    holds_more = _check_folder(out, request)
     files = {DriveFiles(out, drive): count for drive, count in counts.items()}
     read_only = out.is_dir() and not os.access(out, os.W_OK)
-    if read_only and not any(drive.missing(count) for drive, count in files.items()):
-        return make_report([one for drive in files for one in drive.summaries(files[drive])], 0)
+    if (read_only or holds_more) and not any(d.missing(count) for d, count in files.items()):
+        return _report_of(files, 0)
     out.mkdir(parents=True, exist_ok=True)
     from tqdm import tqdm  # simulated scans that are not written do not need it
 
     with only_writer(out / ".lock", f"simulates into {out}", wait=True):
-        _check_folder(out, request)  # again: another process may have written meanwhile
-        write(out / _MANIFEST, to_json(request))
+        # Again, since another process may have written meanwhile.
+        holds_more = _check_folder(out, request)
+        if not holds_more:
+            write(out / _MANIFEST, to_json(request))
         tasks = []
         for drive, count in files.items():
             missing, simulator = drive.missing(count), simulators[drive.drive]
@@ -162,6 +165,8 @@ def simulate(
         with tqdm(total=scans, initial=complete, unit="scan", desc="simulate", disable=None) as bar:
             for num_written in in_processes(_run, tasks, workers):
                 bar.update(num_written)
+        if holds_more:  # whose poses and report are those of all scans
+            return _report_of(files, num_missing)
         return _finish(out, files, num_missing)
 
 
@@ -209,8 +214,8 @@ def _share(scans: int, drives: list[str]) -> dict[str, int]:
     return {drive: count for drive, count in zip(drives, counts, strict=True) if count}
 
 
-def _check_folder(out: Path, request: dict[str, Any]) -> None:
-    """Refuse a folder that holds anything but this data set."""
+def _check_folder(out: Path, request: dict[str, Any]) -> bool:
+    """Refuse a folder that holds anything but this data set; whether it is one of more scans."""
     manifest = out / _MANIFEST
     if out.exists() and not out.is_dir():
         raise ValueError(f"{out} is a file; give the folder of the data set")
@@ -220,15 +225,16 @@ def _check_folder(out: Path, request: dict[str, Any]) -> None:
                 f"{out} holds a data set that was not simulated ({_MANIFEST} is missing); "
                 f"give another folder"
             )
-        return
+        return False
     stored = _read_json(manifest)
-    if isinstance(stored.get("scans"), int) and stored["scans"] < request["scans"]:
-        stored["scans"] = request["scans"]  # scans are added
-    if different := list(differences(stored, request)):
+    num_stored, scans = stored.get("scans"), request["scans"]
+    same_scans = stored | ({"scans": scans} if isinstance(num_stored, int) else {})
+    if different := list(differences(same_scans, request)):
         raise ValueError(
             f"{out} holds a data set of another request ({'; '.join(different)}); give another "
             f"folder, or delete it"
         )
+    return isinstance(num_stored, int) and num_stored > scans
 
 
 def differences(stored: Any, wanted: Any, name: str = "") -> Iterator[str]:
@@ -277,6 +283,11 @@ def _finish(out: Path, files: Mapping[DriveFiles, int], num_written: int) -> Sim
     report = make_report(summaries, num_written)
     write(out / "report.json", to_json(report.to_dict()))
     return report
+
+
+def _report_of(files: Mapping[DriveFiles, int], num_written: int) -> SimulationReport:
+    summaries = [one for drive, count in files.items() for one in drive.summaries(count)]
+    return make_report(summaries, num_written)
 
 
 def make_report(summaries: Sequence[Mapping[str, Any]], num_written: int) -> SimulationReport:

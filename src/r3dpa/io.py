@@ -70,14 +70,20 @@ def usable_device(name: str) -> str:
     return name
 
 
-def weights_sha256(state: Mapping[str, Tensor]) -> str:
-    """SHA-256 of the names and bytes of weights, whatever device, memory format or file."""
+def weights_sha256(state: Mapping[str, Tensor], *, ordered: bool = True) -> str:
+    """SHA-256 of the names and bytes of weights, whatever device, memory format or file.
+
+    Args:
+        state: Weights by name.
+        ordered: Take the names in alphabetical order, else in that of ``state``, as the hashes of
+            feature extractors do that files of feature grids and references hold.
+    """
     import torch
 
     digest = hashlib.sha256()
-    for name in sorted(state):
+    for name in sorted(state) if ordered else state:
         digest.update(name.encode())
-        # As bytes: numpy knows no bfloat16.
+        # As bytes, since NumPy has no bfloat16.
         values = state[name].detach().cpu().contiguous().flatten().view(torch.uint8)
         digest.update(values.numpy().data)
     return digest.hexdigest()

@@ -14,6 +14,7 @@ import yaml
 
 from r3dpa.cli import main
 from r3dpa.data import FeatureGrids, find_scans
+from r3dpa.data.datamodules import default_features_dir
 from r3dpa.data.feature_grids import any_settings
 from r3dpa.features import WaffleIron
 from r3dpa.features.scalr import official_name
@@ -100,8 +101,9 @@ class TestForms:
         assert f" 0 scans to do, {NUM} done; " in capsys.readouterr().out
         assert before == {path: path.stat().st_mtime_ns for path in store.iterdir()}
 
-    def test_folders_and_a_shipped_yaml(self, tmp_path, capsys):
+    def test_folders_and_a_shipped_yaml(self, tmp_path, capsys, monkeypatch):
         """Any folder of scans, and the KITTI-360 layout, of which both splits are made."""
+        monkeypatch.chdir(tmp_path)
         for drive in ("0000", "0003"):
             name = f"2013_05_28_drive_{drive}_sync"
             make_scans(tmp_path / "layout" / "data_3d_raw" / name / "velodyne_points/data", 1)
@@ -116,7 +118,7 @@ class TestForms:
         for folder, words in forms.items():
             words += ["--extractor", "geometric", "--data.init_args.num_workers", 0]
             features("--data", *words)
-            grids = tmp_path / folder / "feature_grids" / "geometric"
+            grids = default_features_dir(str(tmp_path / folder), "geometric")
             assert any_settings(grids).extractor["name"] == "geometric"
             assert num_written(grids / "8x64") == 2
             assert capsys.readouterr().out.endswith(f" per second, in {grids / '8x64'}\n")

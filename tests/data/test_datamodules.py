@@ -1,4 +1,5 @@
 from itertools import chain
+from pathlib import Path
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ from r3dpa.data import (
     check,
     write_bin,
 )
+from r3dpa.data.datamodules import default_features_dir
 from r3dpa.data.scans import KITTI360_DRIVES
 from r3dpa.geometry import LidarSensor
 
@@ -54,8 +56,9 @@ def test_overfit_batches_takes_the_first_scans_again_and_again(data, fit):
 
 
 def test_missing_grids_are_made_once_and_need_their_extractor(
-    tmp_path, data, scaled_points, caplog
+    tmp_path, data, scaled_points, caplog, monkeypatch
 ):
+    monkeypatch.chdir(tmp_path)
     extractor = scaled_points()
     module = data(extractor=extractor)
     for _ in range(2):
@@ -67,15 +70,41 @@ def test_missing_grids_are_made_once_and_need_their_extractor(
     assert module.feature_dim == 4
     batch = next(iter(module.train_dataloader()))
     assert batch["feature_grid"].shape == (2, 8, 4)
-    folder = tmp_path / "scans/feature_grids/scaled"
+    folder = module.features_dir
+    assert folder.parts[:2] == ("runs", "feature_grids")
+    assert not (tmp_path / "scans/feature_grids").exists()
     stored = data(features_dir=str(folder))
     assert (stored.feature_dim, stored.feature_source) == (4, "scaled")
-    with pytest.raises(StoreError, match="No feature grid"):
+    with pytest.raises(StoreError, match="no feature grid"):
         data(features_dir=str(tmp_path / "none")).setup("fit")
     data(features_dir=str(tmp_path / "none")).setup("predict")
     assert data().feature_source is None
-    with pytest.raises(StoreError, match="No feature grids in"):
+    with pytest.raises(StoreError, match="no feature grids in"):
         _ = data(features_dir=str(tmp_path / "none")).feature_source
+
+
+def test_grids_beside_the_scans_are_used_and_go_there_where_the_folder_says_so(
+    tmp_path, data, scaled_points, make_scans
+):
+    """Earlier versions made them there; folders of one name have different places."""
+    beside = tmp_path / "scans/feature_grids/scaled"
+    beside.mkdir(parents=True)
+    assert data(extractor=scaled_points()).features_dir == beside
+    assert data(extractor=scaled_points(), features_dir="here").features_dir == Path("here")
+    other = default_features_dir(str(tmp_path / "a/scans"), "scaled")
+    assert other.parent.name.startswith("scans-")
+    assert other != default_features_dir(str(tmp_path / "b/scans"), "scaled")
+    simulated = SimulatedDataModule(str(tmp_path / "sim"), extractor=scaled_points())
+    assert simulated.features_dir == tmp_path / "sim/feature_grids/scaled"
+
+
+def test_a_small_folder_makes_smaller_batches(tmp_path, make_scans, sensor, fit, caplog):
+    """Six scans, one of them held out, for a batch of eight."""
+    data = LidarDataModule(str(make_scans(tmp_path / "few", 6)), sensor=sensor, grid_size=(2, 4))
+    with caplog.at_level("INFO"):
+        module = fit(data, 2)
+    assert [sorted(batch) for batch in module.seen] == [[0, 1, 2, 3, 4]] * 2
+    assert "only 5 training scans: batch_size 5 in place of 8" in caplog.text
 
 
 def test_held_out_folders_and_limit(tmp_path, make_scans, sensor):
@@ -156,11 +185,11 @@ def test_one_split_alone(tmp_path, make_scans, sensor, part, fit, trainer, recor
     assert sum(len(batch["name"]) for batch in data.predict_dataloader()) == 4
     if part == "train":
         assert len(fit(data, 2).seen) == 2
-        with pytest.raises(ValueError, match=r"No held-out scan in .*missing drives"):
+        with pytest.raises(ValueError, match=r"no held-out scan in .*missing drives"):
             trainer(1).validate(recorder(), data, verbose=False)
     else:
         trainer(1).validate(recorder(), data, verbose=False)
-        with pytest.raises(ValueError, match=r"No scan to train on in .*missing drives"):
+        with pytest.raises(ValueError, match=r"no scan to train on in .*missing drives"):
             fit(data, 1)
 
 
@@ -213,3 +242,7 @@ def test_simulated_data_are_made_once_and_feed_a_fit(tmp_path, scaled_points, fi
     assert len(data.train_set) == 3
     filled = torch.stack([sample["valid_mask"] for sample in data.train_set]).float().mean()
     assert 0.5 < filled < 1
+    smaller = SimulatedDataModule(str(tmp_path / "sim"), num_scans=2, simulation_seed=3)
+    smaller.prepare_data()
+    smaller.setup("fit")
+    assert [len(smaller.train_set), len(smaller.val_set)] == [1, 1]

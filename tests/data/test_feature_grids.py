@@ -196,7 +196,7 @@ def test_an_error_keeps_what_was_made(tmp_path, made, projection, scaled_points,
     with pytest.raises(error, match=reason):
         write_feature_grids(scans, extractor, projection, [GRID], root)
     FeatureGrids(root, scans[:4], projection, GRID)
-    with pytest.raises(StoreError, match=r"No feature grids of .*\.bin.*r3dpa data features"):
+    with pytest.raises(StoreError, match=r"no feature grids of .*\.bin.*r3dpa data features"):
         FeatureGrids(root, scans, projection, GRID)
     scans[4].path.write_bytes(data)
     assert write_feature_grids(scans, scaled_points(), projection, [GRID], root) == 1
@@ -275,5 +275,5 @@ def test_other_settings_are_refused_when_writing(made, projection, scaled_points
     assert planned(scans) == 0  # complete grids serve any precision
     assert planned(scans, (4, 4)) == 5  # another size may be made otherwise
     assert any_settings(root).extractor["name"] == "scaled"
-    with pytest.raises(StoreError, match=r"No feature grids in .*r3dpa data features"):
+    with pytest.raises(StoreError, match=r"no feature grids in .*r3dpa data features"):
         any_settings(root / "nothing")

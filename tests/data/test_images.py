@@ -12,8 +12,9 @@ import torch
 from PIL import Image
 
 from r3dpa.data import DeadLeaves, ImageDataModule, ImageFolder
+from r3dpa.data.dead_leaves import dead_leaves
 from r3dpa.data.image_datamodule import latent_statistics
-from r3dpa.data.images import ImageEntry, ImageError, center_crop, dead_leaves
+from r3dpa.data.images import ImageEntry, ImageError, center_crop
 from r3dpa.data.store import CachedTensors, tensor_cache
 
 
@@ -161,14 +162,16 @@ def test_splits_mirrors_and_range(folder):
     torch.testing.assert_close(plain["image"], expected)
 
 
-def test_fewer_images_than_processes_are_refused(folder):
+def test_few_images_make_smaller_batches_and_fewer_than_processes_are_refused(folder, caplog):
     module = ImageDataModule(ImageFolder(str(folder)), image_size=8, batch_size=2, val_every=4)
     module.setup("fit")
     module.trainer = SimpleNamespace(world_size=2, global_rank=0, limit_train_batches=1.0)
     assert [len(batch["image"]) for batch in module.val_dataloader()] == [1]  # both get it
-    with pytest.raises(
-        ValueError, match=r"3 training images do not fill .* 2 images .*more images"
-    ):
+    with caplog.at_level("INFO"):
+        assert [len(batch["image"]) for batch in module.train_dataloader()] == [1]
+    assert "only 3 training images: batch_size 1 in place of 2" in caplog.text
+    module.trainer.world_size = 4
+    with pytest.raises(ValueError, match=r"3 training images do not fill .* 4 processes"):
         module.train_dataloader()
 
 

@@ -173,7 +173,7 @@ def test_other_settings_never_find_these_rows(tmp_path, name, settings, shape):
     fill(cache, (0, 5))
     other = tensor_cache(tmp_path, name, settings, shape)
     assert other.missing(items(0, 5)) == items(0, 5)
-    with pytest.raises(StoreError, match=r"No cached tensors of drive.*0000\.bin and 4 more"):
+    with pytest.raises(StoreError, match=r"no cached tensors of drive.*0000\.bin and 4 more"):
         CachedTensors(other, items(0, 5))
     assert tensor_cache(tmp_path, "a", {"x": 1}, SHAPE) == cache
 
@@ -235,7 +235,7 @@ def test_a_torn_line_and_rows_beyond_the_journal_do_not_count(halves, tail):
     with (halves.folder / "shard_00000.rows").open("ab") as rows:
         rows.write(b"\x7f" * 100)  # a row and a half
     assert_holds(halves, items(0, 1))
-    with pytest.raises(StoreError, match=r"No grids of .*0000000001\.bin in"):
+    with pytest.raises(StoreError, match=r"no grids of .*0000000001\.bin in"):
         CachedTensors(halves, items(0, 2))
     fill(halves, (1, 3))
     assert_holds(halves, items(0, 3))

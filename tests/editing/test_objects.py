@@ -150,7 +150,7 @@ def test_library_comes_back_from_its_file(tmp_path, library):
 
 
 def test_other_objects_and_features_of_another_source_are_refused(library):
-    with pytest.raises(ValueError, match="no 'tram' among the objects; there are road, car"):
+    with pytest.raises(ValueError, match="unknown class 'tram'; choose from road, car"):
         library.feature("tram")
     library.check_source("scaled", 4)
     for source, dim in (("scalr", 4), (None, 4), ("scaled", 768)):

@@ -140,7 +140,6 @@ def test_another_request_is_refused_with_both_values(tmp_path):
     base = {"scans": 2, "seed": 5, "effects": {"range_noise": "off"}, **SMALL}
     for change, message in (
         ({"seed": 6}, r"\(seed 5 there, 6 now\)"),
-        ({"scans": 1}, r"\(scans 2 there, 1 now\)"),
         ({"sensor": hdl64e(40)}, r"\(sensor\.shots 32 there, 40 now\)"),
         ({"sensor": hdl32e()}, r"sensor\.lasers\.inclination_rad 64 values there"),
         ({"effects": {}}, r"\(effects\.range_noise 'off' there, None now\)"),
@@ -167,6 +166,21 @@ def test_a_data_set_grows_and_keeps_its_scans(tmp_path):
     assert before == {path: path.stat().st_mtime_ns for path in before}
     simulate(whole, 7, **request)
     assert files_of(grown) == files_of(whole)
+
+
+def test_a_larger_data_set_serves_a_smaller_request(tmp_path):
+    """Its files stay; only what is missing of the smaller one is made."""
+    request = {"drives": ["0003", "0009", "0000"]} | SMALL
+    simulate(tmp_path, 7, **request)
+    before = files_of(tmp_path)
+    report = simulate(tmp_path, 3, **request)
+    assert report.scans_per_drive == {"0003": 1, "0009": 1, "0000": 1}
+    assert (report.num_written, files_of(tmp_path)) == (0, before)
+    for number in (0, 2):
+        (points_folder(tmp_path, "0003") / "data" / f"{number:010d}.bin").unlink()
+    assert simulate(tmp_path, 3, **request).num_written == 1
+    assert simulate(tmp_path, 7, **request).num_written == 1
+    assert files_of(tmp_path) == before
 
 
 def test_foreign_data_are_left_alone(tmp_path):

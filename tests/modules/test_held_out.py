@@ -13,7 +13,7 @@ import torch.multiprocessing as mp
 from tiny_stages import QUIET, SILENT, TinyData, stage_module
 from torch.utils.data import DataLoader
 
-from r3dpa.data.loaders import LoaderModule
+from r3dpa.data.loader_module import LoaderModule
 from r3dpa.modules import steps
 
 pytestmark = [

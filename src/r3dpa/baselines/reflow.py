@@ -15,7 +15,8 @@ from tqdm import tqdm
 from r3dpa.baselines.generator import FULL_SCALE
 from r3dpa.baselines.stages import scene_generator
 from r3dpa.checkpoints import read_checkpoint, weights_sha256
-from r3dpa.data.loaders import LoaderModule, at_least
+from r3dpa.data.loader_module import LoaderModule
+from r3dpa.data.loaders import at_least
 from r3dpa.data.posterior_cache import filled
 from r3dpa.data.store import CachedTensors, ItemKey, Store, tensor_cache
 from r3dpa.flow.noise import scene_noise

@@ -18,8 +18,9 @@ from lidarsim.scan_files import (
 )
 from r3dpa.data.augmentation import Augmentation
 from r3dpa.data.datasets import LidarBatch, LidarDataset, PointSample
+from r3dpa.data.dead_leaves import DeadLeaves
 from r3dpa.data.feature_grids import Extractor, FeatureGrids, pooled_grids, write_feature_grids
-from r3dpa.data.images import DeadLeaves, ImageFolder
+from r3dpa.data.images import ImageFolder
 from r3dpa.data.samples import read_samples
 from r3dpa.data.scans import Scan, check, find_scans, kitti360_scans
 from r3dpa.data.store import StoreError

@@ -104,7 +104,7 @@ class Augmentation:
             raise ValueError(
                 f"augmentation.{options}: the features {name} are not known to "
                 f"{' or to '.join(wrong.values())}. Switch {options} off, use GeometricFeatures, "
-                "or train on the approximation with augmentation.approximate_grids: true."
+                "or train on the approximation with augmentation.approximate_grids: true"
             )
 
     def check_latents(self, latent_columns: int, grid_columns: int) -> None:

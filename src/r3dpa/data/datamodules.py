@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import replace
 from glob import has_magic
@@ -13,14 +14,16 @@ from lightning.pytorch.utilities.rank_zero import rank_zero_info
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
-from lidarsim import simulate
+from lidarsim import TRAIN_DRIVES, VAL_DRIVES, simulate, split_scans
+from lidarsim.drive_files import drive_name
 from lidarsim.scan_files import read_scan
 from lidarsim.scene import Conditions
 from lidarsim.weather import WeatherPrior
 from r3dpa.data.augmentation import Augmentation, AugmentedDataset
 from r3dpa.data.datasets import CachedImages, DrawnPoints, LidarDataset
 from r3dpa.data.feature_grids import Extractor, FeatureGrids, any_settings, write_feature_grids
-from r3dpa.data.loaders import LoaderModule, at_least
+from r3dpa.data.loader_module import LoaderModule
+from r3dpa.data.loaders import at_least
 from r3dpa.data.scans import Scan, evenly, find_scans, kitti360_scans
 from r3dpa.data.store import CachedTensors
 from r3dpa.geometry import (
@@ -39,7 +42,7 @@ _SCALR_DIM = 768  # width of the published feature grids
 _SCANS_TO_FIT = 8  # scans that the ring inclinations are measured in
 _EMPTY_SPLIT = (
     "all scans are of the other split. Look at val_every and val_drives, or, in the KITTI-360 "
-    "layout, for missing drives with `r3dpa data check`."
+    "layout, for missing drives with `r3dpa data check`"
 )
 
 
@@ -60,17 +63,16 @@ class LidarDataModule(LoaderModule):
         grid_size: Rows and columns (h, w) of the feature grid.
         extractor: Frozen network, see :class:`r3dpa.data.Extractor`; makes the grids that are
             missing before training. Without it, ``features_dir`` must hold all of them.
-        features_dir: Folder of the feature grids of one extractor, of any grid sizes; with an
-            extractor and a single folder of scans, ``<scans>/feature_grids/<extractor>`` if None.
-            Without either, no grids.
+        features_dir: Folder of the feature grids of one extractor, of any grid sizes; by default
+            that of :func:`default_features_dir`. No grids without folder and extractor.
         batch_size: Scans per batch **per process**; an optimiser step sees ``batch_size`` x
             processes x ``accumulate_grad_batches`` scans.
         num_workers: Loader processes per training process.
         seed: Seed of the order of training scans and of their augmentation.
-        val_every: Every this many scans, one is held out; None for none. Neighbours in a recording
+        val_every: Hold out every n-th scan; None for no validation split. Neighbours in a recording
             look alike: hold out whole recordings by ``val_drives`` for an honest score.
         val_drives: Folders, relative to the root, that are held out whole; replaces ``val_every``.
-        limit: Use this many scans of each split at most, spread evenly over it.
+        limit: Maximum scans per split, evenly spaced.
         prepare_data_per_node: Whether one process of each node prepares the data, as node-local
             disks need; by default one process of all does, for a disk that the nodes share.
         augmentation: Rotation and mirroring of training scans; none by default.
@@ -78,6 +80,8 @@ class LidarDataModule(LoaderModule):
             stay those of the clear scans, which ``augmentation.approximate_grids`` must allow.
     """
 
+    #: Whether the folder of scans is the data module's own, which may hold the feature grids too.
+    makes_scans = False
     # Also of subclasses that make their batches without __init__.
     augmentation = _AUGMENTATION
     weather_prior: WeatherPrior | None = None
@@ -129,7 +133,7 @@ class LidarDataModule(LoaderModule):
         if weather is not None and with_grids:
             raise ValueError(
                 "weather: the feature grids are those of the clear scans. Train without them, or "
-                "on these with augmentation.approximate_grids: true."
+                "on these with augmentation.approximate_grids: true"
             )
 
     @property
@@ -162,13 +166,17 @@ class LidarDataModule(LoaderModule):
         return ScanGeometry(self.projection, self.codec, self.grid_size)
 
     def split(self) -> tuple[list[Scan], list[Scan]]:
-        """Training and held-out scans, each sorted, before ``limit``; ``ValueError`` if none."""
+        """Training and held-out scans, each sorted, before ``limit``.
+
+        Raises:
+            ValueError: If there is no scan, or ``val_drives`` names a folder without one.
+        """
         scans = find_scans(self.scans)
         if self.val_drives:
             drives = {scan.drive for scan in scans}
             if unknown := set(self.val_drives) - drives:
                 raise ValueError(
-                    f"val_drives names {sorted(unknown)}, but the scans are of {sorted(drives)}."
+                    f"val_drives names {sorted(unknown)}, but the scans are of {sorted(drives)}"
                 )
             held_out = {scan for scan in scans if scan.drive in self.val_drives}
         else:
@@ -176,7 +184,7 @@ class LidarDataModule(LoaderModule):
         return [scan for scan in scans if scan not in held_out], sorted(held_out)
 
     def limited_split(self) -> tuple[list[Scan], list[Scan]]:
-        """The same within ``limit``."""
+        """Training and held-out scans within ``limit``."""
         train, val = self.split()
         return evenly(train, self.limit), evenly(val, self.limit)
 
@@ -185,7 +193,7 @@ class LidarDataModule(LoaderModule):
         return torch.from_numpy(read_scan(scan.path, self.sensor))
 
     def prepare_data(self) -> None:
-        """Make the feature grids that are missing, but to predict."""
+        """Make the missing feature grids, except to predict."""
         predicting = self.trainer is not None and self.trainer.predicting
         if predicting or self.features_dir is None or self.extractor is None:
             return
@@ -196,7 +204,7 @@ class LidarDataModule(LoaderModule):
         rank_zero_info(f"feature grids: {num_made} made, in {self.features_dir}")
 
     def setup(self, stage: str) -> None:
-        """Index the scans and open the store of feature grids, but to ``"predict"``."""
+        """Index the scans; open the store of feature grids, except to predict."""
         train, val, self.projection = self._scans_and_projection()
         scans, grids = sorted(train + val), None
         if self.features_dir is not None and stage != "predict":
@@ -221,7 +229,7 @@ class LidarDataModule(LoaderModule):
         """Shuffled, resumable loader of full batches; in order under ``overfit_batches``."""
         dataset = self.train_set
         if not len(dataset):
-            raise ValueError(f"No scan to train on in {self.scans}: {_EMPTY_SPLIT}")
+            raise ValueError(f"no scan to train on in {self.scans}: {_EMPTY_SPLIT}")
         if getattr(self.trainer, "overfit_batches", 0) > 0:
             return self.loader(dataset, train=False)
         if not self.augmentation.active and self.weather_prior is None:
@@ -236,7 +244,7 @@ class LidarDataModule(LoaderModule):
         if len(self.val_set):
             return self.loader(self.val_set, train=False)
         if self.trainer is not None and self.trainer.state.fn in ("validate", "test"):
-            raise ValueError(f"No held-out scan in {self.scans}: {_EMPTY_SPLIT}")
+            raise ValueError(f"no held-out scan in {self.scans}: {_EMPTY_SPLIT}")
         return []
 
     test_dataloader = val_dataloader
@@ -246,15 +254,14 @@ class LidarDataModule(LoaderModule):
         return self.loader(self.all_set, train=False)
 
     def _find_features_dir(self, features_dir: str | None) -> Path | None:
-        if features_dir is not None or self.extractor is None:
-            return None if features_dir is None else Path(features_dir)
-        scans = self.scans
-        if not isinstance(scans, str) or has_magic(scans) or Path(scans).is_file():
-            raise ValueError(
-                f"features_dir is needed for scans given as {self.scans!r}: only a single folder "
-                "has a default place for its feature grids."
-            )
-        return Path(scans) / "feature_grids" / cast(Extractor, self.extractor).name
+        if features_dir is not None:
+            return Path(features_dir)
+        if self.extractor is None:
+            return None
+        name = cast(Extractor, self.extractor).name
+        if self.makes_scans:
+            return Path(cast(str, self.scans)) / "feature_grids" / name
+        return default_features_dir(self.scans, name)
 
     def _scans_and_projection(self) -> tuple[list[Scan], list[Scan], Projection]:
         train, val = self.split()
@@ -264,6 +271,28 @@ class LidarDataModule(LoaderModule):
             points = (torch.from_numpy(read_scan(file, self.sensor)[:, :3]) for file in files)
             projection = RingProjection.fit(points, self.sensor)
         return evenly(train, self.limit), evenly(val, self.limit), projection
+
+
+def default_features_dir(scans: str | list[str], extractor: str) -> Path:
+    """Folder of feature grids for a single folder of scans where none is given.
+
+    ``runs/feature_grids/<folder>-<hash of its path>/<extractor>``, so that nothing is written
+    beside the scans of a user; ``<scans>/feature_grids/<extractor>`` where that folder exists.
+
+    Raises:
+        ValueError: If the scans are those of a file, glob or list.
+    """
+    if not isinstance(scans, str) or has_magic(scans) or Path(scans).is_file():
+        raise ValueError(
+            f"features_dir is needed for scans given as {scans!r}: only a single folder has a "
+            "default place for its feature grids"
+        )
+    beside = Path(scans) / "feature_grids" / extractor
+    if beside.is_dir():
+        return beside
+    place = Path(scans).absolute()
+    digest = hashlib.sha256(str(place).encode()).hexdigest()[:8]
+    return Path("runs", "feature_grids", f"{place.name}-{digest}", extractor)
 
 
 class KITTI360DataModule(LidarDataModule):
@@ -291,8 +320,10 @@ class KITTI360DataModule(LidarDataModule):
         return kitti360_scans(self.root, "train"), kitti360_scans(self.root, "val")
 
 
-class SimulatedDataModule(KITTI360DataModule):
+class SimulatedDataModule(LidarDataModule):
     """Simulated streets in the KITTI-360 layout, made before the first use.
+
+    A folder that holds more scans of the same request serves a smaller one.
 
     Args:
         root: Folder of the data set; filled where it is not complete.
@@ -305,6 +336,8 @@ class SimulatedDataModule(KITTI360DataModule):
         kwargs: Arguments of :class:`LidarDataModule`.
     """
 
+    makes_scans = True
+
     def __init__(
         self,
         root: str,
@@ -315,11 +348,24 @@ class SimulatedDataModule(KITTI360DataModule):
         weather: Conditions | None = None,
         **kwargs: Any,
     ) -> None:
-        super().__init__(root, **kwargs)
-        if num_scans < 2:
-            raise ValueError(f"num_scans must be at least 2, one of them held out, got {num_scans}")
-        self.num_scans, self.simulation_seed = num_scans, simulation_seed
+        super().__init__(scans=root, val_every=None, val_drives=None, **kwargs)
+        at_least(2, num_scans=num_scans)  # one of them is held out
+        self.root, self.num_scans, self.simulation_seed = root, num_scans, simulation_seed
         self.simulation_sensor, self.effects, self.weather = simulation_sensor, effects, weather
+
+    def split(self) -> tuple[list[Scan], list[Scan]]:
+        """Scans of the official training and validation drives."""
+        counts = split_scans(self.num_scans, (*TRAIN_DRIVES, *VAL_DRIVES))
+        wanted = {
+            f"{drive_name(drive)}/{number:010d}"
+            for drive, count in counts.items()
+            for number in range(count)
+        }
+        train, val = kitti360_scans(self.root, "train"), kitti360_scans(self.root, "val")
+        return (
+            [scan for scan in train if scan.name in wanted],
+            [scan for scan in val if scan.name in wanted],
+        )
 
     def prepare_data(self) -> None:
         """Simulate the scans and make the feature grids that are missing."""
@@ -363,7 +409,7 @@ class PointDataModule(LoaderModule):
         if source.extractor is not None:
             raise ValueError(
                 "data.init_args.source.init_args.extractor must be null: a network on points is "
-                "trained without feature grids."
+                "trained without feature grids"
             )
         self.source, self.prepare, self.weather_prior = source, prepare, weather
 

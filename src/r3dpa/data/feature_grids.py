@@ -17,10 +17,10 @@ from typing import Any, Literal, Protocol, Self
 
 import torch
 from torch import Tensor
-from torch.utils.data import DataLoader
 from tqdm import tqdm
 
 from r3dpa.data.datasets import PointDataset, PointSample
+from r3dpa.data.loaders import plain_loader
 from r3dpa.data.scans import Scan
 from r3dpa.data.store import CachedTensors, Store, StoreError, writing
 from r3dpa.geometry import Projection, pool_cells, projection_to_dict
@@ -119,8 +119,8 @@ def _wanted(projection: Projection, extractor: Extractor | None) -> dict[str, An
 
 def _made_otherwise(key: str, stored: Any, wanted: Any, folder: Path) -> StoreError:
     return StoreError(
-        f"Feature grids in {folder} were made with {key} {stored}, but {key} {wanted} is asked "
-        f"for: restore that setting, or give another features_dir and make new grids {REMEDY}."
+        f"feature grids in {folder} were made with {key} {stored}, but {key} {wanted} is needed: "
+        f"restore that setting, or give another features_dir and make new grids {REMEDY}"
     )
 
 
@@ -138,7 +138,7 @@ def stored_settings(features_dir: str | Path) -> dict[tuple[int, int], GridSetti
         except (LookupError, TypeError, ValueError, OverflowError, RecursionError) as error:
             raise StoreError(
                 f"{path} is damaged ({error!r:.200}): delete {path.parent} and make its grids "
-                f"again {REMEDY}."
+                f"again {REMEDY}"
             ) from error
         found[settings.grid_size] = settings
     return found
@@ -149,7 +149,7 @@ def any_settings(features_dir: str | Path) -> GridSettings:
     stored = stored_settings(features_dir)
     if not stored:
         raise StoreError(
-            f"No feature grids in {features_dir}: make them {REMEDY}, or give an extractor."
+            f"no feature grids in {features_dir}: make them {REMEDY}, or give an extractor"
         )
     return next(iter(stored.values()))
 
@@ -204,7 +204,7 @@ def plan(
     the range image.
     """
     if not grid_sizes:
-        raise ValueError("grid_sizes is empty: give at least one, for example [[8, 64]].")
+        raise ValueError("grid_sizes is empty: give at least one, for example [[8, 64]]")
     features_dir, scans = Path(features_dir), sorted(scans)
     wanted, stored = _wanted(projection, extractor), stored_settings(features_dir)
     stores, missing, num_bytes = {}, set(), 0
@@ -247,7 +247,7 @@ def pooled_grids(
                 if not made[-1].isfinite().all():
                     raise StoreError(
                         f"{sample.scan.path}: extractor {extractor.name} gave NaN or infinite "
-                        "features; run it in float32 or leave this scan out."
+                        "features; run it in float32 or leave this scan out"
                     )
     return {size: torch.stack(made) for size, made in grids.items()}
 
@@ -276,13 +276,8 @@ def write_feature_grids(
         return 0  # complete grids may lie on a read-only disk
     with features_lock(features_dir):
         todo = plan(*arguments)  # another process may have made some
-        loader = DataLoader(
-            PointDataset(todo.missing, projection.sensor, extractor.prepare),
-            batch_size=batch_size,
-            collate_fn=list,
-            num_workers=workers,
-            generator=torch.Generator(),  # the default draws from the global random state
-        )
+        dataset = PointDataset(todo.missing, projection.sensor, extractor.prepare)
+        loader = plain_loader(dataset, batch_size, workers, collate_fn=list)
         with ExitStack() as stack:
             writers = {
                 size: stack.enter_context(store.writer()) for size, store in todo.stores.items()

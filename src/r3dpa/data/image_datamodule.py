@@ -12,7 +12,8 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from r3dpa.data.images import ImageEntry, ImageSource
-from r3dpa.data.loaders import LoaderModule, at_least
+from r3dpa.data.loader_module import LoaderModule
+from r3dpa.data.loaders import at_least
 from r3dpa.data.scans import evenly
 from r3dpa.data.store import CachedTensors
 

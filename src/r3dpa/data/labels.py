@@ -15,30 +15,75 @@ from lidarsim.cloud_formats import ScanError, read_bytes
 from lidarsim.scan_files import read_beside
 from r3dpa.io import atomic_path
 
-_NAMES = {
-    6: "ground,road,sidewalk,parking,rail track,building,wall,fence,guard rail,bridge,tunnel",
-    17: "pole,polegroup,traffic light,sign,vegetation,terrain",
-    24: "person,rider,car,truck,bus,caravan,trailer,train,motorcycle,bicycle,garage,gate,stop",
-    37: "smallpole,lamp,trash bin,vending machine,box,unknown construction,unknown vehicle",
-    44: "unknown object",
-}
 #: Names by KITTI-360 class id; every other id counts as unlabelled.
 CLASS_NAMES = {
-    first + place: name
-    for first, names in _NAMES.items()
-    for place, name in enumerate(names.split(","))
+    6: "ground",
+    7: "road",
+    8: "sidewalk",
+    9: "parking",
+    10: "rail track",
+    11: "building",
+    12: "wall",
+    13: "fence",
+    14: "guard rail",
+    15: "bridge",
+    16: "tunnel",
+    17: "pole",
+    18: "polegroup",
+    19: "traffic light",
+    20: "sign",
+    21: "vegetation",
+    22: "terrain",
+    24: "person",
+    25: "rider",
+    26: "car",
+    27: "truck",
+    28: "bus",
+    29: "caravan",
+    30: "trailer",
+    31: "train",
+    32: "motorcycle",
+    33: "bicycle",
+    34: "garage",
+    35: "gate",
+    36: "stop",
+    37: "smallpole",
+    38: "lamp",
+    39: "trash bin",
+    40: "vending machine",
+    41: "box",
+    42: "unknown construction",
+    43: "unknown vehicle",
+    44: "unknown object",
 }
-_ID = {name: number for number, name in CLASS_NAMES.items()}
-# Ids of SemanticKITTI; those from 252 on are of things that move.
-_SEMANTIC_NAMES = """10 252 car; 11 bicycle; 13 257 bus; 15 motorcycle; 16 256 train; 18 258 truck;
-20 259 unknown vehicle; 30 254 person; 31 32 253 255 rider; 40 60 road; 44 parking; 48 sidewalk;
-49 ground; 50 building; 51 fence; 52 unknown construction; 70 71 vegetation; 72 terrain; 80 pole;
-81 sign; 99 unknown object"""
+# Ids of SemanticKITTI by class; those from 252 on are of things that move.
+_SEMANTIC_KITTI_IDS = {
+    "car": (10, 252),
+    "bicycle": (11,),
+    "bus": (13, 257),
+    "motorcycle": (15,),
+    "train": (16, 256),
+    "truck": (18, 258),
+    "unknown vehicle": (20, 259),
+    "person": (30, 254),
+    "rider": (31, 32, 253, 255),
+    "road": (40, 60),
+    "parking": (44,),
+    "sidewalk": (48,),
+    "ground": (49,),
+    "building": (50,),
+    "fence": (51,),
+    "unknown construction": (52,),
+    "vegetation": (70, 71),
+    "terrain": (72,),
+    "pole": (80,),
+    "sign": (81,),
+    "unknown object": (99,),
+}
+# KITTI-360 class by id of SemanticKITTI, whose 0 is unlabelled and 1 an outlier.
+_ID_OF = {name: number for number, name in CLASS_NAMES.items()}
 _SEMANTIC_KITTI = {0: 0, 1: 0} | {
-    int(word): _ID[" ".join(w for w in entry.split() if not w.isdigit())]
-    for entry in _SEMANTIC_NAMES.split(";")
-    for word in entry.split()
-    if word.isdigit()
+    number: _ID_OF[name] for name, numbers in _SEMANTIC_KITTI_IDS.items() for number in numbers
 }
 
 

@@ -1,4 +1,7 @@
-"""Training loader that restarts at any batch and does not depend on the number of processes."""
+"""Loaders: a training loader that restarts at any batch, and a plain one.
+
+The order of training does not depend on the number of processes.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,6 @@ from typing import Any, cast
 
 import numpy as np
 import torch
-from lightning.pytorch import LightningDataModule
 from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
 
@@ -87,21 +89,25 @@ class ResumableLoader(DataLoader[Any]):
         }
 
     def load_state_dict(self, state_dict: dict[str, int]) -> None:
-        """Go on at a saved place; ``ValueError`` within an epoch of other data, order or batch."""
+        """Continue at a saved place.
+
+        Raises:
+            ValueError: If it lies within an epoch of other data, another order or another batch.
+        """
         samples, num_samples = state_dict["samples"], len(cast(Sized, self.dataset))
         seed = cast(EpochSampler, self.sampler).seed
         if samples and (state_dict["dataset_size"], state_dict["seed"]) != (num_samples, seed):
             raise ValueError(
-                f"The checkpoint was saved within an epoch over {state_dict['dataset_size']} "
+                f"the checkpoint was saved within an epoch over {state_dict['dataset_size']} "
                 f"samples in the order of seed {state_dict['seed']}, but this run has "
                 f"{num_samples} samples and seed {seed}: resume with the same data and seed, or "
-                "start a new run from the weights."
+                "start a new run from the weights"
             )
         if samples % self._samples_per_batch:
             raise ValueError(
-                f"The checkpoint was saved after {samples} samples of an epoch, no multiple of "
+                f"the checkpoint was saved after {samples} samples of an epoch, no multiple of "
                 f"this run's batch of {self._samples_per_batch} samples (batch_size x processes): "
-                "resume with the same total batch."
+                "resume with the same total batch"
             )
         self._resume_at = (state_dict["epoch"], samples // self._samples_per_batch)
 
@@ -120,71 +126,67 @@ def training_loader(
 ) -> ResumableLoader:
     """Shuffled, resumable loader of full batches; draws nothing from the global random state.
 
-    ``batch_size`` is per process, ``limit_batches`` is ``limit_train_batches`` of the trainer,
-    ``with_epoch`` indexes the data set with ``(epoch, index)``, ``options`` are of ``DataLoader``.
-    ``ValueError`` if the data set is smaller than one batch over all processes.
+    Args:
+        dataset: Data set, of one process or of several with equal data sets.
+        batch_size: Samples per batch and process.
+        seed: Seed of the order.
+        num_replicas: Number of processes.
+        rank: Number of this process.
+        limit_batches: ``limit_train_batches`` of the trainer.
+        with_epoch: Index the data set with ``(epoch, index)``.
+        kind: Name of the samples in error messages.
+        **options: Options of ``DataLoader``.
+
+    Raises:
+        ValueError: If the data set is smaller than one batch over all processes.
     """
     num_samples = len(cast(Sized, dataset))
     if num_samples < batch_size * num_replicas:
         raise ValueError(
             f"{num_samples} training {kind} do not fill one batch of {batch_size} {kind} for each "
-            f"of {num_replicas} processes: use a smaller batch_size or more {kind}."
+            f"of {num_replicas} processes: use a smaller batch_size or more {kind}"
         )
     sampler = EpochSampler(dataset, seed, num_replicas, rank, with_epoch)
     loader = ResumableLoader(
-        dataset, sampler=sampler, drop_last=True, **_common(batch_size, **options)
+        dataset,
+        batch_size=batch_size,
+        sampler=sampler,
+        drop_last=True,
+        generator=torch.Generator(),  # the default draws from the global random state
+        **options,
     )
     batches = limit_batches if isinstance(limit_batches, int) else limit_batches * len(loader)
     loader.batches_per_epoch = min(int(batches), len(loader))
     return loader
 
 
-def _common(batch_size: int, num_workers: int = 0, **options: Any) -> dict[str, Any]:
-    return options | {
-        "batch_size": batch_size,
+def plain_loader(
+    dataset: Dataset[Any], batch_size: int, num_workers: int = 0, **options: Any
+) -> DataLoader[Any]:
+    """Loader of all samples in order; draws nothing from the global random state.
+
+    ``options`` are of ``DataLoader``.
+    """
+    return DataLoader(
+        dataset,
+        batch_size=batch_size,
+        num_workers=num_workers,
+        generator=torch.Generator(),  # the default draws from the global random state
+        **options,
+    )
+
+
+def worker_options(num_workers: int) -> dict[str, Any]:
+    """Options of a ``DataLoader`` whose processes serve every epoch of a training."""
+    return {
         "num_workers": num_workers,
         "pin_memory": torch.cuda.is_available(),
         "persistent_workers": num_workers > 0,
-        "generator": torch.Generator(),  # the default draws from the global random state
     }
-
-
-class LoaderModule(LightningDataModule):
-    """Settings of the loaders, and the loaders for the processes of the trainer."""
-
-    def __init__(self, batch_size: int, num_workers: int, seed: int) -> None:
-        super().__init__()
-        at_least(1, batch_size=batch_size)
-        at_least(0, num_workers=num_workers, seed=seed)
-        self.batch_size, self.num_workers, self.seed = batch_size, num_workers, seed
-
-    def __getattr__(self, name: str) -> Any:
-        """AttributeError with the remedy: data sets and geometry are known after ``setup``."""
-        raise AttributeError(
-            f"{type(self).__name__} has no {name}; if it depends on the data, call prepare_data() "
-            "and setup('fit') first"
-        )
-
-    def loader(
-        self, dataset: Dataset[Any], *, train: bool, kind: str = "scans", **options: Any
-    ) -> DataLoader[Any]:
-        """Loader as :func:`training_loader`, or of all samples in order."""
-        trainer = self.trainer
-        replicas, rank = (1, 0) if trainer is None else (trainer.world_size, trainer.global_rank)
-        options |= {"batch_size": self.batch_size, "num_workers": self.num_workers}
-        if train:
-            limit = 1.0 if trainer is None else trainer.limit_train_batches
-            options |= {"limit_batches": limit, "seed": self.seed, "kind": kind}
-            return training_loader(dataset, num_replicas=replicas, rank=rank, **options)
-        # Some samples come twice, so that all processes have as many batches.
-        in_order: DistributedSampler[Any] = DistributedSampler(
-            dataset, replicas, rank, shuffle=False
-        )
-        return DataLoader(dataset, sampler=in_order, **_common(**options))
 
 
 def at_least(least: int, **values: int | None) -> None:
     """Raise ``ValueError`` for a named argument below its range; None passes."""
     for name, value in values.items():
         if value is not None and value < least:
-            raise ValueError(f"{name} must be at least {least}, got {value}.")
+            raise ValueError(f"{name} must be at least {least}, got {value}")

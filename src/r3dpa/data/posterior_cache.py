@@ -9,8 +9,9 @@ from typing import Any, TypeVar
 import torch
 from lightning.pytorch.utilities import rank_zero_info
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import Dataset
 
+from r3dpa.data.loaders import plain_loader
 from r3dpa.data.store import Cacheable, CachedTensors, Store, tensor_cache
 from r3dpa.io import weights_sha256
 
@@ -47,12 +48,7 @@ def encoded_once(
     cache = tensor_cache(root, "posterior", about, (2 * channels, *size))
 
     def moments(own: list[Item]) -> Iterator[Tensor]:
-        loader = DataLoader(
-            dataset_of(own),
-            batch_size=datamodule.batch_size,
-            num_workers=datamodule.num_workers,
-            generator=torch.Generator(),  # the default draws from the global random state
-        )
+        loader = plain_loader(dataset_of(own), datamodule.batch_size, datamodule.num_workers)
         for batch in loader:
             posterior = module.vae.encode(batch[image].to(module.device))
             yield torch.cat([posterior.mean, posterior.logvar], dim=1)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
@@ -14,14 +13,16 @@ from zlib import crc32
 import numpy as np
 import torch
 from lightning.pytorch.utilities.rank_zero import rank_zero_info
-from torch.utils.data import DataLoader, Dataset
+from torch import Tensor
+from torch.utils.data import Dataset
 from tqdm import tqdm
 
 from lidarsim import SIMULATOR_VERSION, TRAIN_DRIVES, VAL_DRIVES, Simulator, split_scans
-from r3dpa.data.datamodules import SimulatedDataModule
+from lidarsim.scene import Conditions
+from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.data.datasets import PointSample
-from r3dpa.data.feature_grids import GridSettings, pooled_grids
-from r3dpa.data.loaders import at_least
+from r3dpa.data.feature_grids import Extractor, GridSettings, pooled_grids
+from r3dpa.data.loaders import at_least, plain_loader
 from r3dpa.data.pixel_codes import decode_pixels, encode_pixels
 from r3dpa.data.store import CachedTensors, ItemKey, Store, tensor_cache
 from r3dpa.geometry import (
@@ -34,6 +35,8 @@ from r3dpa.geometry import (
     projection_to_dict,
 )
 from r3dpa.io import only_writer
+
+_SCANS_PER_BATCH = 8  # that are simulated between two writes
 
 
 @dataclass(frozen=True, order=True)
@@ -64,7 +67,7 @@ class SimulatedImage:
 class CachedPixels:
     """Images of a cache: of ranges alone in float16, else in the codes of ``pixel_codes``."""
 
-    rows: CachedTensors[Any]
+    rows: CachedTensors[SimulatedImage]
     range_max_m: float
 
     def read(self, image: SimulatedImage, /) -> Pixels:
@@ -74,25 +77,46 @@ class CachedPixels:
         return decode_pixels(row, self.range_max_m) if coded else Pixels(row)
 
 
-class SimulatedImageDataModule(SimulatedDataModule):
+class SimulatedImageDataModule(LidarDataModule):
     """Simulated streets whose range images are cached in float16, 131 kB each; points are dropped.
 
-    Images are made before the first use, and so are feature grids if there is an extractor: those
-    that are missing only. Ranges are rounded to 11 bits, 1 cm at 20 m. Where the codec has channels
-    of intensity or class, both are cached beside the range: 197 kB each.
+    Images are made before the first use, and so are feature grids if there is an extractor: only
+    those that are missing. Ranges are rounded to 11 bits, 1 cm at 20 m. Where the codec has
+    channels of intensity or class, both are cached beside the range: 197 kB each.
 
     Args:
         root: Folder of the caches.
-        every: Take every this many scans of a drive; neighbours are 0.1 s apart.
-        kwargs: Arguments of :class:`SimulatedDataModule`; only ``projection: spherical``.
+        every: Stride in scans of a drive; neighbours are 0.1 s apart.
+        num_scans: Scans to simulate, over all drives; 2 or more, a fifth of them held out.
+        simulation_seed: Seed of streets and instrument.
+        simulation_sensor: Instrument: ``hdl64e``, ``hdl32e``, ``vls128`` or a calibration file;
+            ``sensor`` is about the range images.
+        effects: ``auto``, ``on`` or ``off`` by effect; those not named are ``auto``.
+        weather: Weather of all scans; drawn where None.
+        kwargs: Arguments of :class:`LidarDataModule`; only ``projection: spherical``.
     """
 
-    def __init__(self, root: str, every: int = 1, **kwargs: Any) -> None:
-        super().__init__(root, **kwargs)
+    makes_scans = True
+
+    def __init__(
+        self,
+        root: str,
+        every: int = 1,
+        num_scans: int = 1000,
+        simulation_seed: int = 0,
+        simulation_sensor: str = "hdl64e",
+        effects: dict[str, str | bool] | None = None,
+        weather: Conditions | None = None,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(scans=root, val_every=None, val_drives=None, **kwargs)
         at_least(1, every=every)
+        at_least(2, num_scans=num_scans)  # one of them is held out
         if self.projection_kind != "spherical":
             raise ValueError("projection must be spherical: the points are not kept to fit rings")
-        self.every = every
+        self.root, self.every, self.num_scans = root, every, num_scans
+        self.simulation_seed, self.simulation_sensor = simulation_seed, simulation_sensor
+        self.effects, self.weather = effects, weather
 
     def split(self) -> tuple[list[Any], list[Any]]:
         """Images of the official training and validation drives."""
@@ -112,25 +136,26 @@ class SimulatedImageDataModule(SimulatedDataModule):
     def prepare_data(self) -> None:
         """Simulate what is missing, and make its feature grids."""
         train, val, projection = self._scans_and_projection()
-        stores = [self._store]
+        grids = None
         if self.features_dir is not None and self.extractor is not None:
-            extractor = cast(Any, self.extractor.eval())
-            stores.append(
-                GridSettings.of(extractor, projection, self.grid_size).store(self.features_dir)
-            )
+            extractor = cast(Extractor, self.extractor.eval())
+            settings = GridSettings.of(extractor, projection, self.grid_size)
+            grids = settings.store(self.features_dir)
         with only_writer(Path(self.root) / ".lock", f"simulates into {self.root}", wait=True):
-            lacking: set[Any] = {item for store in stores for item in store.missing(train + val)}
-            if lacking:
-                self._simulate(sorted(lacking), projection, stores)
+            missing = set(self._store.missing(train + val))
+            if grids is not None:
+                missing |= set(grids.missing(train + val))
+            if missing:
+                self._simulate(sorted(missing), projection, grids)
 
     @cached_property
     def images(self) -> CachedPixels:
         """Cached images of all scans."""
         train, val, _ = self._scans_and_projection()
-        rows = CachedTensors(self._store, sorted(train + val))
+        rows: CachedTensors[SimulatedImage] = CachedTensors(self._store, sorted(train + val))
         return CachedPixels(rows, self.sensor.range_max_m)
 
-    def points(self, scan: Any) -> torch.Tensor:
+    def points(self, scan: Any) -> Tensor:
         """Points ``(P, 3)`` at the centres of the pixels."""
         return points_of(self.images.read(scan).range_m, SphericalProjection(self.sensor))
 
@@ -141,7 +166,7 @@ class SimulatedImageDataModule(SimulatedDataModule):
 
     @property
     def _store(self) -> Store:
-        request = {
+        request: dict[str, Any] = {
             "simulator_version": SIMULATOR_VERSION,
             "seed": self.simulation_seed,
             "sensor": self.simulation_sensor,
@@ -150,16 +175,15 @@ class SimulatedImageDataModule(SimulatedDataModule):
             "projection": projection_to_dict(SphericalProjection(self.sensor)),
         }
         shape = (self.sensor.beams, self.sensor.columns)
-        root, request = Path(self.root), json.loads(json.dumps(request))
         if not self._with_values:
-            return tensor_cache(root, "range_image", request, shape, "float16")
+            return tensor_cache(Path(self.root), "range_image", request, shape, "float16")
         request["classes"] = [list(semantic.labels) for semantic in SEMANTIC_CLASSES]
-        return tensor_cache(root, "labelled_image", request, (3, *shape), "uint8")
+        return tensor_cache(Path(self.root), "labelled_image", request, (3, *shape), "uint8")
 
     def _simulate(
-        self, items: Sequence[SimulatedImage], projection: Projection, stores: Sequence[Store]
+        self, items: Sequence[SimulatedImage], projection: Projection, grids: Store | None
     ) -> None:
-        extractor: Any = self.extractor if len(stores) > 1 else None
+        """Simulate items; write their images and, where there is a store for them, their grids."""
         rank_zero_info(f"simulating {len(items)} range images into {self.root}")
         simulators = {
             drive: Simulator(
@@ -171,44 +195,38 @@ class SimulatedImageDataModule(SimulatedDataModule):
             )
             for drive in (*TRAIN_DRIVES, *VAL_DRIVES)
         }
-        prepare = None if extractor is None else extractor.prepare
-        loader = DataLoader(
-            _Simulated(items, simulators, projection, prepare, self._with_values),
-            batch_size=8,
-            collate_fn=list,
-            num_workers=self.num_workers,
-            generator=torch.Generator(),  # the default draws from the global random state
-        )
+        extractor = cast(Extractor, self.extractor)
+        prepare = None if grids is None else extractor.prepare
+        dataset = _Simulated(items, simulators, projection, prepare, self._with_values)
+        loader = plain_loader(dataset, _SCANS_PER_BATCH, self.num_workers, collate_fn=list)
         with ExitStack() as stack:
-            images, *grids = [stack.enter_context(store.writer()) for store in stores]
-            for samples in tqdm(loader, desc="simulate", unit_scale=8, unit="scan", disable=None):
-                keys = [sample.key for sample, _ in samples]
-                images.add(keys, torch.stack([row for _, row in samples]))
-                for writer in grids:
-                    found = [sample for sample, _ in samples]
-                    made = pooled_grids(extractor, found, projection, [self.grid_size])
-                    writer.add(keys, made[self.grid_size])
+            images = stack.enter_context(self._store.writer())
+            grid_writer = None if grids is None else stack.enter_context(grids.writer())
+            for batch in tqdm(
+                loader, desc="simulate", unit_scale=_SCANS_PER_BATCH, unit="scan", disable=None
+            ):
+                samples = [sample for sample, _ in batch]
+                keys = [sample.key for sample in samples]
+                images.add(keys, torch.stack([row for _, row in batch]))
+                if grid_writer is not None:
+                    pooled = pooled_grids(extractor, samples, projection, [self.grid_size])
+                    grid_writer.add(keys, pooled[self.grid_size])
 
 
-class _Simulated(Dataset[Any]):
+@dataclass(eq=False, repr=False)
+class _Simulated(Dataset[tuple[PointSample, Tensor]]):
     """Points, prepared for an extractor if there is one, and row of the cache of each scan."""
 
-    def __init__(
-        self,
-        items: Sequence[SimulatedImage],
-        simulators: dict[str, Simulator],
-        projection: Projection,
-        prepare: Any,
-        with_values: bool,
-    ) -> None:
-        self.items, self.simulators = items, simulators
-        self.projection, self.prepare = projection, prepare
-        self.with_values = with_values
+    items: Sequence[SimulatedImage]
+    simulators: dict[str, Simulator]
+    projection: Projection
+    prepare: Callable[..., Any] | None
+    with_values: bool
 
     def __len__(self) -> int:
         return len(self.items)
 
-    def __getitem__(self, index: int) -> tuple[PointSample, torch.Tensor]:
+    def __getitem__(self, index: int) -> tuple[PointSample, Tensor]:
         item = self.items[index]
         scan = self.simulators[item.drive].scan(item.number)
         points, labels = torch.from_numpy(scan.points), torch.from_numpy(np.int64(scan.labels))

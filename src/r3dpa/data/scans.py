@@ -79,7 +79,7 @@ def find_scans(source: str | Path | Sequence[str | Path]) -> list[Scan]:
         )
     twice = [str(file) for file, count in Counter(files).items() if count > 1]
     if twice:
-        raise ValueError(f"Scans given twice: {', '.join(twice[:5])}. Name every file once.")
+        raise ValueError(f"scans given twice: {', '.join(twice[:5])}; name every file once")
     parent = os.path.commonpath([file.parent for file in files])
     root = entries[0] if single else Path(parent)
     scans = sorted(Scan(_drive_name(file.parent, root), file.stem, file) for file in files)
@@ -110,8 +110,8 @@ def kitti360_scans(root: str | Path, split: Split) -> list[Scan]:
     }
     if not any(scans.values()):
         raise ValueError(
-            f"No scan of the {split} split in {root}, nor of the other one: `r3dpa data check "
-            f"{root}` names what is missing; use LidarDataModule for scans in other folders."
+            f"no scan of the {split} split in {root}, nor of the other one: `r3dpa data check "
+            f"{root}` names what is missing; use LidarDataModule for scans in other folders"
         )
     return sorted(scans[split])
 

@@ -140,7 +140,7 @@ def writing(what: str, folder: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise StoreError(
-            f"{what.capitalize()} cannot be written to {folder} ({error.strerror}): give a folder "
+            f"{what} cannot be written to {folder} ({error.strerror}): give a folder "
             "on a disk that can be written and has space"
         ) from error
 
@@ -285,7 +285,7 @@ class CachedTensors(Generic[Item]):
     def _missing(self, items: Sequence[Cacheable]) -> StoreError:
         more = f" and {len(items) - 1} more" if len(items) > 1 else ""
         return StoreError(
-            f"No {self.store.what} of {items[0].path}{more} in {self.store.folder}, or the file "
+            f"no {self.store.what} of {items[0].path}{more} in {self.store.folder}, or the file "
             "was replaced, or copied without its time of change, since: make what is missing "
             f"{self.store.remedy}"
         )

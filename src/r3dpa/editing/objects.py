@@ -6,9 +6,8 @@ Letters: K values before the linear step, N = h * w cells, D feature width, C cl
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
-from operator import add
 from pathlib import Path
 from typing import Any, Self
 
@@ -76,10 +75,13 @@ class ObjectLibrary:
         return str(self.extractor["name"])
 
     def feature(self, name: str) -> Tensor:
-        """Mean feature ``(D,)`` of a class; ``ValueError`` lists the known ones."""
+        """Mean feature ``(D,)`` of a class.
+
+        Raises:
+            ValueError: If the library lacks the class; the message lists those that it has.
+        """
         if name not in self.names:
-            known = ", ".join(self.names)
-            raise ValueError(f"there is no {name!r} among the objects; there are {known}")
+            raise ValueError(f"unknown class {name!r}; choose from {', '.join(self.names)}")
         return self.features[self.names.index(name)]
 
     def check_source(self, source: str | None, dim: int) -> None:
@@ -89,7 +91,7 @@ class ObjectLibrary:
             raise ValueError(
                 f"the objects have features of {self.source!r} of width {own}, but the network is "
                 f"aligned with those of {source!r} of width {dim}: make them again with `r3dpa "
-                "objects --ckpt` for its checkpoint"
+                "data objects --ckpt` for its checkpoint"
             )
 
     def save(self, path: str | Path) -> None:
@@ -107,7 +109,11 @@ class ObjectLibrary:
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read what :meth:`save` wrote; ``ValueError`` names a missing or damaged file."""
+        """Read what :meth:`save` wrote.
+
+        Raises:
+            ValueError: If the file is missing or damaged.
+        """
         try:
             with safe_open(path, framework="pt") as file:
                 card = json.loads(file.metadata()[_CARD])
@@ -120,9 +126,38 @@ class ObjectLibrary:
             return cls(features, classes, card["extractor"], card["projection"], (rows, columns))
         except (*UNPICKLING_ERRORS, SafetensorError) as error:
             raise ValueError(
-                f"{path} holds no objects ({first_line(error)}): give the file that `r3dpa "
+                f"{path} holds no objects ({first_line(error)}): give the file that `r3dpa data "
                 "objects` wrote"
             ) from error
+
+
+class _ClassSums:
+    """Weighted sums over the cells of one class."""
+
+    def __init__(self, dim: int) -> None:
+        self.features = torch.zeros(dim, dtype=torch.float64)
+        self.directions = torch.zeros(dim, dtype=torch.float64)
+        self.weight = 0.0
+        self.num_scans = self.num_cells = self.num_points = 0
+
+    def add(self, shares: Tensor, features: Tensor, num_points: int) -> None:
+        """Add the cells of a scan: their shares ``(N,)`` and features ``(N, D)``, float64."""
+        self.features = self.features + shares @ features
+        self.directions = self.directions + shares @ F.normalize(features, dim=1)
+        self.weight += shares.sum().item()
+        self.num_scans += 1
+        self.num_cells += len(shares)
+        self.num_points += num_points
+
+    def mean(self) -> Tensor:
+        """Mean feature ``(D,)`` float64."""
+        return self.features / self.weight
+
+    def result(self, name: str) -> ObjectClass:
+        """Statistics of the class."""
+        cosine = (F.normalize(self.mean(), dim=0) @ self.directions / self.weight).item()
+        spread = max(0.0, 1 - cosine)
+        return ObjectClass(name, self.num_scans, self.num_cells, self.num_points, spread)
 
 
 @torch.no_grad()  # not inference mode: a target of guidance takes part in a backward pass
@@ -144,52 +179,63 @@ def object_library(
 
     Source: R3DPA (ICRA 2026) averages the points of the class in a single scan.
 
-    ``grid_size`` are the rows and columns (h, w) of the cells. ``ScanError`` if a scan or its
-    labels cannot be used; ``ValueError`` if no class is shown, or a feature is not finite.
+    Args:
+        scans: Scans with labels, see :func:`r3dpa.data.labels.read_labels`.
+        extractor: Feature source of the library.
+        projection: Projection whose pixels the cells consist of.
+        grid_size: Rows and columns (h, w) of the cells.
+
+    Raises:
+        ScanError: If a scan or its labels cannot be used.
+        ValueError: If no point has a known class, or a feature is not finite.
     """
-    cell_rows, cell_columns = projection.sensor.cell_size(grid_size)
-    lift = getattr(extractor, "lift", torch.nn.Identity())
-    # By class: features and directions, weighted; weight; numbers of scans, cells and points.
-    found: dict[str, tuple[Any, ...]] = {}
+    sums: dict[str, _ClassSums] = {}
     for scan in scans:
-        whole = torch.from_numpy(read_scan(scan.path, projection.sensor))
-        labels = torch.from_numpy(read_labels(scan.path, len(whole))) & 0xFFFF
-        values = extractor.point_features([extractor.prepare(whole)])[0]
-        points = whole[:, :3]
-        row, column = projection.pixel_of(points)
-        cell = row // cell_rows * grid_size[1] + column // cell_columns
-        kept = in_range(points, projection.sensor)
-        totals = torch.bincount(cell[kept], minlength=grid_size[0] * grid_size[1])
-        for number, name in CLASS_NAMES.items():
-            own = (kept & (labels == number)).nonzero()[:, 0]
-            if len(own) == 0:
-                continue
-            cells, counts = cell[own].unique(return_counts=True)
-            order = own[cell[own].argsort(stable=True)].to(values.device)
-            first = (counts.cumsum(0) - counts).to(values.device)
-            lifted = lift(F.embedding_bag(order, values.float(), first, mode="mean")).double().cpu()
-            if not lifted.isfinite().all():
+        points = torch.from_numpy(read_scan(scan.path, projection.sensor))
+        labels = torch.from_numpy(read_labels(scan.path, len(points))) & 0xFFFF
+        cells = _cells_of_classes(points, labels, extractor, projection, grid_size)
+        for name, shares, features, num_points in cells:
+            if not features.isfinite().all():
                 raise ValueError(
                     f"{scan.path}: extractor {extractor.name} gave NaN or infinite features; leave "
                     "this scan out"
                 )
-            shares = counts / totals[cells].double()
-            directions = shares @ F.normalize(lifted, dim=1)
-            part = shares @ lifted, directions, shares.sum().item(), 1, len(cells), len(own)
-            found[name] = tuple(map(add, found[name], part)) if name in found else part
-    if not found:
+            sums.setdefault(name, _ClassSums(features.shape[1])).add(shares, features, num_points)
+    names = [name for name in CLASS_NAMES.values() if name in sums]
+    if not names:
         raise ValueError("the scans have no labelled point within range: give more scans")
-    features, results = [], []
-    for name in (name for name in CLASS_NAMES.values() if name in found):
-        total, directions, weight, num_scans, num_cells, num_points = found[name]
-        mean = total / weight
-        cosine = (F.normalize(mean, dim=0) @ directions / weight).item()
-        features.append(mean.float())
-        results.append(ObjectClass(name, num_scans, num_cells, num_points, max(0.0, 1 - cosine)))
     return ObjectLibrary(
-        torch.stack(features),
-        tuple(results),
+        torch.stack([sums[name].mean().float() for name in names]),
+        tuple(sums[name].result(name) for name in names),
         json.loads(json.dumps({"name": extractor.name, "settings": extractor.settings})),
         projection_to_dict(projection),
         (grid_size[0], grid_size[1]),
     )
+
+
+def _cells_of_classes(
+    points: Tensor,
+    labels: Tensor,
+    extractor: Extractor,
+    projection: Projection,
+    grid_size: tuple[int, int],
+) -> Iterator[tuple[str, Tensor, Tensor, int]]:
+    """Cells of a scan ``(P, 4)`` by class: name, shares ``(N,)``, features ``(N, D)``, points."""
+    cell_rows, cell_columns = projection.sensor.cell_size(grid_size)
+    lift = getattr(extractor, "lift", torch.nn.Identity())
+    values = extractor.point_features([extractor.prepare(points)])[0]
+    row, column = projection.pixel_of(points[:, :3])
+    cell = row // cell_rows * grid_size[1] + column // cell_columns
+    within = in_range(points[:, :3], projection.sensor)
+    totals = torch.bincount(cell[within], minlength=grid_size[0] * grid_size[1])
+    for number, name in CLASS_NAMES.items():
+        selected = (within & (labels == number)).nonzero()[:, 0]
+        if len(selected) == 0:
+            continue
+        cells, counts = cell[selected].unique(return_counts=True)
+        # Points cell after cell, so that a bag is a cell.
+        by_cell = selected[cell[selected].argsort(stable=True)].to(values.device)
+        first = (counts.cumsum(0) - counts).to(values.device)
+        means = F.embedding_bag(by_cell, values.float(), first, mode="mean")
+        shares = counts / totals[cells].double()
+        yield name, shares, lift(means).double().cpu(), len(selected)

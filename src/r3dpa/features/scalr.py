@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import re
 from collections.abc import Mapping, Sequence
@@ -34,7 +33,7 @@ from r3dpa.features.voxels import (
     prepare_scan,
 )
 from r3dpa.features.waffleiron import WaffleIron
-from r3dpa.io import UNPICKLING_ERRORS, atomic_path, first_line
+from r3dpa.io import UNPICKLING_ERRORS, atomic_path, first_line, weights_sha256
 
 #: Names that :func:`feature_source` accepts.
 SOURCES = ("scalr", "waffleiron-s", "geometric")
@@ -269,9 +268,5 @@ def feature_source(name: str, ckpt: str | Path | None = None, dim: int = 768) ->
 
 
 def sha256(network: nn.Module) -> str:
-    """Hash of all weights and buffers, by name."""
-    digest = hashlib.sha256()
-    for key, value in network.state_dict().items():
-        digest.update(key.encode())
-        digest.update(value.cpu().reshape(-1).view(torch.uint8).numpy())
-    return digest.hexdigest()
+    """Hash of all weights and buffers, in the order of the network."""
+    return weights_sha256(network.state_dict(), ordered=False)

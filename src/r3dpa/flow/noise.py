@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import Literal
 
 import numpy as np
 import torch
@@ -23,5 +24,23 @@ def scene_uniform(shape: Sequence[int], indices: Sequence[int], seed: int) -> Te
 
 def scene_random(seed: int, index: int, *stream: int) -> torch.Generator:
     """Random numbers of a scene, on the CPU; those without a stream are of its noise."""
-    key = np.random.SeedSequence([seed, index, *stream]).generate_state(1, np.uint64)
-    return torch.Generator().manual_seed(int(key[0]) >> 1)
+    return random_generator([seed, index, *stream])
+
+
+def random_generator(
+    key: Sequence[int], device: torch.device | str = "cpu", bits: Literal[32, 63] = 63
+) -> torch.Generator:
+    """Random numbers of a key of whole numbers, 0 or greater: equal keys give equal draws.
+
+    Args:
+        key: Such as seed, stream and number of a batch.
+        device: Where the numbers are drawn.
+        bits: Bits of the seed that the key becomes. Training draws with 32, so that runs of earlier
+            versions can be repeated.
+    """
+    sequence = np.random.SeedSequence(key)
+    if bits == 32:
+        seed = int(sequence.generate_state(1)[0])
+    else:
+        seed = int(sequence.generate_state(1, np.uint64)[0]) >> 1
+    return torch.Generator(device).manual_seed(seed)

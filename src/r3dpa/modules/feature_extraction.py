@@ -12,6 +12,7 @@ from torch.utils.data import DataLoader, DistributedSampler
 
 from r3dpa.data.datasets import PointDataset, PointSample
 from r3dpa.data.feature_grids import Extractor, GridSettings, pooled_grids
+from r3dpa.data.loaders import plain_loader
 from r3dpa.data.scans import Scan
 from r3dpa.data.store import StoreWriter
 from r3dpa.geometry import Projection
@@ -67,14 +68,10 @@ class FeatureExtraction(LightningModule):
         own = self.scans[self.trainer.global_rank :: self.trainer.world_size]
         sensor = cast(Projection, self.projection).sensor
         dataset = PointDataset(own, sensor, self.extractor.prepare)
-        return DataLoader(
-            dataset,
-            batch_size=self.batch_size,
-            # Of one process, so that Lightning does not divide the share once more.
-            sampler=DistributedSampler(dataset, num_replicas=1, rank=0, shuffle=False),
-            num_workers=self.num_workers,
-            collate_fn=list,
-            generator=torch.Generator(),  # the default would draw from the global random state
+        # Of one process, so that Lightning does not divide the share once more.
+        sampler: DistributedSampler[Any] = DistributedSampler(dataset, 1, 0, shuffle=False)
+        return plain_loader(
+            dataset, self.batch_size, self.num_workers, sampler=sampler, collate_fn=list
         )
 
     def transfer_batch_to_device(

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -19,6 +18,7 @@ from r3dpa.data.posterior_cache import filled
 from r3dpa.data.store import CachedTensors, ItemKey, tensor_cache
 from r3dpa.flow import ab3, average_times, average_velocity_steps, ode_times
 from r3dpa.flow.average_velocity import AVERAGE_STEPS, TIME_SHIFT
+from r3dpa.flow.noise import random_generator
 from r3dpa.flow.times import per_sample
 from r3dpa.modules import steps
 from r3dpa.modules.flow_matching import FlowMatching
@@ -154,8 +154,7 @@ class FewStep(FlowMatching):
     @torch.no_grad()
     def solve(self, indices: list[int]) -> Tensor:
         """Points ``(B, 9, C, h, w)`` of trajectories, at the times of 8 average steps."""
-        keys = [np.random.SeedSequence([self.seed, 2, index]) for index in indices]
-        generators = [torch.Generator().manual_seed(int(k.generate_state(1)[0])) for k in keys]
+        generators = [random_generator([self.seed, 2, index], bits=32) for index in indices]
         noise = torch.stack([torch.randn(self.latent_shape, generator=g) for g in generators])
         points = [noise.to(self.device)]
 

@@ -8,7 +8,6 @@ from contextlib import contextmanager
 from typing import Any, NamedTuple, cast
 
 import lightning as L
-import numpy as np
 import torch
 from torch import Tensor, nn
 from torchmetrics import Metric
@@ -16,6 +15,7 @@ from torchmetrics.utilities import dim_zero_cat
 
 from r3dpa import losses
 from r3dpa.flow import sample_time
+from r3dpa.flow.noise import random_generator
 from r3dpa.modules.settings import LossWeights
 from r3dpa.nn import VelocityNetwork
 
@@ -58,8 +58,7 @@ def draw_held_out(module: Any, index: Tensor) -> PathDraws:
 
 
 def _draw(module: Any, key: list[int], total: int) -> PathDraws:
-    state = np.random.SeedSequence(key).generate_state(1)
-    generator = torch.Generator(module.device).manual_seed(int(state[0]))
+    generator = random_generator(key, module.device, bits=32)
     shape = (total, *module.latent_shape)
     return PathDraws(
         torch.randn(shape, generator=generator, device=module.device),
