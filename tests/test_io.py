@@ -1,4 +1,4 @@
-"""Atomic writes and locks."""
+"""Atomic writes, journals and locks."""
 
 import multiprocessing
 import os
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from r3dpa.io import atomic_path, only_writer
+from r3dpa.io import Journal, atomic_path, differences, only_writer
 
 
 def test_the_file_is_on_the_disk_before_its_name_and_the_folder_after(tmp_path, monkeypatch):
@@ -80,3 +80,39 @@ def test_a_lock_that_is_a_link_leaves_the_file_it_leads_to(tmp_path):
     with pytest.raises(OSError, match=r"symbolic links.*\.fit\.lock"), only_writer(lock, "trains"):
         pass
     assert target.read_text() == "mine"
+
+
+@pytest.mark.parametrize("tail", ["", '{"a"', "\0\0", '{"a": 3}'])
+def test_a_journal_goes_on_after_a_kill(tmp_path, tail):
+    """An incomplete last line is ignored; one that lacks only its end counts."""
+    journal = Journal(tmp_path / "jobs.jsonl")
+    assert journal.read() == []
+    journal.add({"a": 1})
+    journal.add({"a": 2}, [])
+    journal.close()
+    journal.path.write_text(journal.path.read_text() + tail)
+    after = Journal(journal.path)
+    lines = after.read()
+    assert lines == [{"a": 1}, {"a": 2}, []] + [{"a": 3}] * (tail == '{"a": 3}')
+    after.start(*lines)
+    after.add("end")
+    assert Journal(journal.path).read() == [*lines, "end"]
+    after.delete()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_damaged_line_of_a_journal_is_no_incomplete_one(tmp_path):
+    (tmp_path / "a").write_text('{"a": 1}\n{"a\n{"a": 2}\n')
+    with pytest.raises(ValueError, match=r"control|delimiter|string"):
+        Journal(tmp_path / "a").read()
+
+
+def test_differences_of_requests_name_both_values():
+    stored = {"seed": 1, "sensor": {"beams": 64}, "columns": list(range(10)), "same": 0}
+    wanted = {"seed": 2, "sensor": {"beams": 32}, "columns": [], "same": 0, "new": "x"}
+    assert list(differences(stored, wanted)) == [
+        "seed 1 there, 2 now",
+        "sensor.beams 64 there, 32 now",
+        "columns 10 values there, [] now",
+        "new None there, 'x' now",
+    ]

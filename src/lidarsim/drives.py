@@ -16,13 +16,13 @@ import json
 import os
 import statistics
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from lidarsim.drive_files import DriveFiles, drive_name, to_json, weather_to_dict, write
-from lidarsim.io import in_processes, only_writer, text_table
+from lidarsim.io import differences, in_processes, only_writer, text_table
 from lidarsim.scan import Simulator, check_switches
 from lidarsim.scene import Conditions
 from lidarsim.sensors.spinning import SpinningLidar, load_sensor
@@ -235,20 +235,6 @@ def _check_folder(out: Path, request: dict[str, Any]) -> bool:
             f"folder, or delete it"
         )
     return isinstance(num_stored, int) and num_stored > scans
-
-
-def differences(stored: Any, wanted: Any, name: str = "") -> Iterator[str]:
-    """Each value of a stored request that differs from the wanted one, as text."""
-    if isinstance(stored, dict) and isinstance(wanted, dict):
-        for key in stored | wanted:
-            place = f"{name}.{key}" if name else key
-            yield from differences(stored.get(key), wanted.get(key), place)
-    elif stored != wanted:
-        yield f"{name} {_short(stored)} there, {_short(wanted)} now"
-
-
-def _short(value: Any) -> str:
-    return f"{len(value)} values" if isinstance(value, list) and len(value) > 9 else repr(value)
 
 
 def _read_json(path: Path) -> dict[str, Any]:

@@ -1,9 +1,10 @@
-"""Atomic writes, locks, worker processes, and checks of names and files."""
+"""Atomic writes, journals, locks, worker processes, and checks of names and files."""
 
 from __future__ import annotations
 
 import errno
 import hashlib
+import json
 import logging
 import multiprocessing
 import os
@@ -18,7 +19,8 @@ import zipfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from io import FileIO
 from pathlib import Path
 from typing import Any, TypeVar
 from uuid import uuid4
@@ -84,6 +86,83 @@ def _fsync(path: Path) -> None:
 def no_follow(path: str, flags: int) -> int:
     """``opener`` for :func:`open`: a symbolic link is an ``OSError``, not the file it leads to."""
     return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0), 0o666)
+
+
+class Journal:
+    """Lines of JSON that a job appends as it goes, by which the same call completes it later.
+
+    A last line that a killed process has left incomplete is ignored.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._file: FileIO | None = None
+
+    def read(self) -> list[Any]:
+        """Values of all lines; none without a file.
+
+        Raises:
+            ValueError: If a complete line is no JSON.
+        """
+        if not self.path.exists():
+            return []
+        complete, _, last = self.path.read_bytes().rpartition(b"\n")
+        # As one list: twice as fast as line by line, which matters for 80 000 lines.
+        values = json.loads(b"[" + b",".join(complete.splitlines()) + b"]")
+        with suppress(ValueError, RecursionError):
+            values.append(json.loads(last))
+        return list(values)
+
+    def start(self, *values: Any) -> None:
+        """Replace all lines."""
+        self.close()
+        write_text(self.path, _json_lines(values))
+
+    def add(self, *values: Any) -> None:
+        """Append lines."""
+        if self._file is None:
+            self._file = FileIO(self.path, "ab", opener=no_follow)
+        append(self._file, _json_lines(values).encode())
+
+    def close(self) -> None:
+        """Close the file, which the next line opens again."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def delete(self) -> None:
+        """Delete the file, if there is one."""
+        self.close()
+        self.path.unlink(missing_ok=True)
+
+
+def _json_lines(values: Iterable[Any]) -> str:
+    return "".join(f"{json.dumps(value)}\n" for value in values)
+
+
+def append(file: FileIO, data: bytes) -> None:
+    """Write all data to an unbuffered file, which may take it in parts; errors name the file."""
+    left = memoryview(data)
+    try:
+        while left:
+            left = left[file.write(left) :]
+    except OSError as error:
+        error.filename = str(file.name)
+        raise
+
+
+def differences(stored: Any, wanted: Any, name: str = "") -> Iterator[str]:
+    """Each value of a stored request that differs from the wanted one, as text."""
+    if isinstance(stored, dict) and isinstance(wanted, dict):
+        for key in stored | wanted:
+            place = f"{name}.{key}" if name else key
+            yield from differences(stored.get(key), wanted.get(key), place)
+    elif stored != wanted:
+        yield f"{name} {_shown(stored)} there, {_shown(wanted)} now"
+
+
+def _shown(value: Any) -> str:
+    return f"{len(value)} values" if isinstance(value, list) and len(value) > 9 else repr(value)
 
 
 def delete_unfinished(folder: Path) -> None:

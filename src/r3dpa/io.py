@@ -17,8 +17,11 @@ from typing import TYPE_CHECKING, Any
 
 from lidarsim.io import (
     UNPICKLING_ERRORS,
+    Journal,
+    append,
     atomic_path,
     delete_unfinished,
+    differences,
     first_line,
     in_processes,
     no_follow,
@@ -35,9 +38,12 @@ if TYPE_CHECKING:
 
 __all__ = [
     "UNPICKLING_ERRORS",
+    "Journal",
+    "append",
     "atomic_path",
     "command",
     "delete_unfinished",
+    "differences",
     "first_line",
     "in_processes",
     "machine",

@@ -56,6 +56,15 @@ def assert_same_scenes(actual, expected, num=3):
 
 
 class TestSample:
+    def test_a_greater_number_adds_to_a_finished_folder(self, tiny_file, scenes, tmp_path):
+        sample(tiny_file, tmp_path, "--num", 2)
+        first = (tmp_path / "bin/000001.bin").stat().st_mtime_ns
+        metadata = sample(tiny_file, tmp_path)
+        assert (metadata["num"], metadata["drawn_by_last_run"]) == (3, 1)
+        assert (tmp_path / "bin/000001.bin").stat().st_mtime_ns == first
+        assert_same_scenes(tmp_path, scenes)
+        assert np.load(tmp_path / "range_m.npy").shape[0] == 3
+
     def test_writes_every_scene(self, scenes):
         clouds = values(scenes)
         assert list(clouds) == ["000000", "000001", "000002"]

@@ -130,12 +130,57 @@ def test_another_request_is_refused_until_it_may_start_anew(tmp_path):
     with writer(tmp_path, 4) as first:
         first.put(scenes(2))
     other = {**REQUEST, "seed": 1}
-    with pytest.raises(ValueError, match=r"2 scenes of an unfinished run with seed 0, not 1.*over"):
+    with pytest.raises(ValueError, match=r"2 scenes of an unfinished .*seed 0 there, 1 now.*over"):
         writer(tmp_path, 4, request=other)
     write(tmp_path, scenes(1, seed=5), request=other, overwrite=True)
     assert files(tmp_path) == ["bin/000000.bin", "metadata.json", "range_m.npy"]
     with pytest.raises(ValueError, match=r"holds scenes already.*--overwrite"):
         writer(tmp_path, 4, request=other)
+
+
+def finish(out, range_m, num, **changes):
+    """Write the scenes that are missing of `num`, as `r3dpa sample` does it."""
+    request = {"seed": 0, "num": num} | changes
+    with writer(out, num, request=request) as open_writer:
+        first = open_writer.num_done
+        open_writer.put(range_m[first:num], nfe=8)
+        open_writer.close()
+        open_writer.finish(request | {"nfe": open_writer.evaluations / num})
+    return first
+
+
+@pytest.mark.parametrize("finished", [True, False])
+def test_more_scenes_are_added_to_those_that_are_there(tmp_path, finished):
+    range_m = scenes(7)
+    if finished:
+        assert finish(tmp_path, range_m, 4) == 0
+    else:
+        with writer(tmp_path, 5, request={"seed": 0, "num": 5}) as stopped:
+            stopped.put(range_m[:4], nfe=8)
+    assert finish(tmp_path, range_m, 7) == 4
+    assert np.array_equal(np.load(tmp_path / "range_m.npy"), range_m.numpy())
+    assert json.loads((tmp_path / "metadata.json").read_text()) == {"seed": 0, "num": 7, "nfe": 8}
+    before = files(tmp_path)
+    with pytest.raises(ValueError, match=r"holds scenes already"):
+        finish(tmp_path, range_m, 7)
+    with pytest.raises(ValueError, match=r"7 scenes of another request \(seed 0 there, 1 now\)"):
+        finish(tmp_path, range_m, 8, seed=1)
+    assert files(tmp_path) == before
+
+
+def test_an_unfinished_folder_of_an_earlier_version_is_completed(tmp_path):
+    """Its state was one line without an end, written anew after each batch."""
+    range_m = scenes(4)
+    with writer(tmp_path, 4) as first:
+        first.put(range_m[:2], nfe=3)
+    state = {"request": REQUEST, "num_done": 2, "evaluations": 6}
+    (tmp_path / ".unfinished.json").write_text(json.dumps(state))
+    with writer(tmp_path, 4) as second:
+        assert (second.num_done, second.evaluations) == (2, 6)
+        second.put(range_m[2:])
+        second.close()
+        second.finish({})
+    assert np.array_equal(np.load(tmp_path / "range_m.npy"), range_m.numpy())
 
 
 def test_a_damaged_state_is_named(tmp_path):
@@ -157,8 +202,8 @@ def test_an_error_while_writing_stops_the_run_with_its_message(tmp_path, monkeyp
     range_m = scenes(40 if where == "put" else 4)
     with pytest.raises(OSError, match=r"No space left.*000003\.bin"):
         write(tmp_path, range_m)
-    state = json.loads((tmp_path / ".unfinished.json").read_text())
-    assert state["num_done"] == 2  # and nothing behind the gap
+    *_, state = (tmp_path / ".unfinished.json").read_text().splitlines()
+    assert json.loads(state)["num_done"] == 2  # and nothing behind the gap
     assert not list(tmp_path.rglob(".*.partial*"))
     monkeypatch.setitem(scene_writer._CLOUD_WRITERS, "bin", real)
     write(tmp_path, range_m)

@@ -13,6 +13,7 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
+from lidarsim import io
 from r3dpa.data import StoreError, store
 from r3dpa.data.store import CachedTensors, Store, tensor_cache
 
@@ -197,7 +198,8 @@ def test_killed_at_every_step_of_a_batch(halves, monkeypatch, moment, part):
                 add(writer, items(first, last))
 
     with monkeypatch.context() as patch:
-        patch.setattr(store, "append", killing)
+        patch.setattr(store, "append", killing)  # of the rows
+        patch.setattr(io, "append", killing)  # of the journal
         child = multiprocessing.get_context("fork").Process(target=write)
         child.start()
         child.join()
@@ -221,7 +223,9 @@ def test_rows_are_on_disk_before_the_journal_names_them(halves, monkeypatch):
             function(file, *data),
         )
 
-    monkeypatch.setattr(store, "append", note("append", store.append))
+    noted = note("append", io.append)
+    monkeypatch.setattr(store, "append", noted)
+    monkeypatch.setattr(io, "append", noted)
     monkeypatch.setattr(os, "fdatasync", note("sync", os.fdatasync))
     fill(halves, (0, 5))
     assert calls == [("append", ".rows"), ("sync", ".rows"), ("append", ".jsonl")]

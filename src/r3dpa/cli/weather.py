@@ -16,12 +16,11 @@ from tqdm import tqdm
 
 from lidarsim.clouds import PointCloud
 from lidarsim.drive_files import to_json, weather_to_dict, write
-from lidarsim.drives import differences
 from lidarsim.faults import Fault, Kind
 from lidarsim.recorded import Instrument, RecordedScan
 from lidarsim.weather import Weather, WeatheredScan, changed_cloud, recorded_scan
 from r3dpa.cli.parser import check_folder
-from r3dpa.io import delete_unfinished, in_processes, no_follow, only_writer
+from r3dpa.io import delete_unfinished, differences, in_processes, no_follow, only_writer
 
 _REQUEST, _LINES, _REPORT, _PAGE = "request.json", ".unfinished.jsonl", "report.jsonl", "scans.html"
 _LOST, _MOVED = 254, 255  # colours of the page, beside those of Origin

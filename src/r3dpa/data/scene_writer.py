@@ -18,35 +18,51 @@ from torch import Tensor
 
 from lidarsim.scan_files import write_bin, write_npz, write_ply
 from r3dpa.data.labels import write_labels
-from r3dpa.data.store import append
 from r3dpa.geometry import points_of, values_at_returns
 from r3dpa.geometry.projection import Projection
-from r3dpa.io import delete_unfinished, no_follow, only_writer, write_text
+from r3dpa.io import (
+    Journal,
+    append,
+    delete_unfinished,
+    differences,
+    no_follow,
+    only_writer,
+    write_text,
+)
 
 _CLOUD_WRITERS: dict[str, Callable[[Path, Tensor], None]] = {"bin": write_bin, "ply": write_ply}
 #: Files that ``r3dpa sample`` and the edits write beside their metadata.
 _WRITTEN = (
-    *(*_CLOUD_WRITERS, "range_m.npy", "scenes.npz", "range", "birds_eye", "scene_3d"),
-    *("before.npy", "mask.png", "edit.png", "edit.html", "labels", "scans"),
+    *_CLOUD_WRITERS,
+    "labels",
+    "range_m.npy",
+    "scenes.npz",
+    "range",
+    "birds_eye",
+    "scene_3d",
+    "before.npy",
+    "mask.png",
+    "edit.png",
+    "edit.html",
+    "scans",
 )
 
 
 class SceneWriter:
-    """Writes scenes in order, in a thread, and completes an interrupted run.
+    """Writes scenes in order, in a thread; completes an interrupted run, or adds to a finished one.
 
     ======================= ===================================================================
     ``range_m.npy``         ``(num, H, W)`` float32 metres, -1 without a return
-    ``bin/000000.bin``      points of each scene, if asked for; ``ply/000000.ply`` likewise
+    ``bin/000000.bin``      points of each scene, with format ``bin``; ``ply/000000.ply`` likewise
     ``labels/000000.label`` uint32 KITTI-360 class of each of these points, if scenes have them
-    ``scenes.npz``          all scenes in one file, without intensity; only if asked for
+    ``scenes.npz``          all scenes in one file, without intensity, with format ``npz``
     ``metadata.json``       written last: a folder without it is unfinished
     ======================= ===================================================================
 
-    Until the end there are two hidden files, ``.unfinished.npy`` and ``.unfinished.json`` with the
-    request and the number of scenes written. At most two batches are in memory. An error of the
-    thread is raised by the next :meth:`put`, by :meth:`close`, or at the end of the block.
-    ``ValueError`` if another process writes to ``out``, or it holds scenes, or unfinished ones of
-    another request.
+    Until the end there are two hidden files, ``.unfinished.npy`` and the journal
+    ``.unfinished.json`` with the request and the number of scenes written. At most two batches are
+    in memory. An error of the thread is raised by the next :meth:`put`, by :meth:`close`, or at the
+    end of the block.
 
     Args:
         out: Folder; one process at a time writes to it.
@@ -55,6 +71,10 @@ class SceneWriter:
         formats: Files of points: ``bin``, ``ply``, ``npz``.
         request: All settings that determine the scenes, as JSON values.
         overwrite: Start anew in a folder that holds scenes, finished or not.
+
+    Raises:
+        ValueError: If another process writes to ``out``, or ``out`` holds scenes of another
+            request, or as many as ``num``.
 
     Attributes:
         num_done: Scenes written so far, also by interrupted runs of the same request.
@@ -74,15 +94,14 @@ class SceneWriter:
         self._projection = projection
         self._formats = tuple(formats)
         self._request = json.loads(json.dumps(request))  # tuples become lists, as in the file
-        self._state, self._unfinished = out / ".unfinished.json", out / ".unfinished.npy"
+        self._journal = Journal(out / ".unfinished.json")
+        self._unfinished = out / ".unfinished.npy"
         with ExitStack() as alone:
             alone.enter_context(only_writer(out / ".lock", f"writes scenes to {out}"))
             if (out / "metadata.json").exists() and not overwrite:
-                raise ValueError(
-                    f"{out} holds scenes already; give another --out or --overwrite true"
-                )
+                self._reopen()
             delete_unfinished(out)
-            if self._state.exists() and not overwrite:
+            if self._journal.path.exists() and not overwrite:
                 self.num_done, self.evaluations = self._written_before()
             if not self.num_done:
                 self._clear()
@@ -98,9 +117,10 @@ class SceneWriter:
         with self._alone:
             self._thread.shutdown()
             self._file.close()
+            self._journal.close()
             if error is not None and not self.num_done:
                 self._unfinished.unlink(missing_ok=True)
-                self._state.unlink(missing_ok=True)
+                self._journal.delete()
         if error is None:
             self._wait()
 
@@ -146,24 +166,46 @@ class SceneWriter:
     def finish(self, metadata: dict[str, Any]) -> None:
         """Write ``metadata.json``, which marks the folder as complete."""
         write_text(self.out / "metadata.json", json.dumps(metadata, indent=2) + "\n")
-        self._state.unlink()
+        self._journal.delete()
+
+    def _reopen(self) -> None:
+        """Make a finished folder an unfinished one of more scenes."""
+        metadata_path = self.out / "metadata.json"
+        try:
+            metadata = json.loads(metadata_path.read_text(encoding="utf-8"))
+            num_done, nfe = int(metadata["num"]), float(metadata["nfe"])
+        except (ValueError, KeyError, TypeError):
+            num_done, nfe = self.num, 0.0
+        if num_done >= self.num:
+            raise ValueError(
+                f"{self.out} holds scenes already; give another --out or --overwrite true"
+            )
+        stored = {key: metadata.get(key) for key in self._request} | {"num": self.num}
+        if different := "; ".join(differences(stored, self._request)):
+            raise ValueError(
+                f"{self.out} holds {num_done} scenes of another request ({different}); give "
+                "another --out or --overwrite true"
+            )
+        self._start_journal(num_done, round(nfe * num_done))
+        metadata_path.unlink()
 
     def _written_before(self) -> tuple[int, int]:
         try:
-            state = json.loads(self._state.read_text(encoding="utf-8"))
-            found, num_done = state["request"], int(state["num_done"])
-            evaluations = int(state["evaluations"])
+            first, *later = self._journal.read()
+            stored, last = first["request"], [first, *later][-1]
+            num_done, evaluations = int(last["num_done"]), int(last["evaluations"])
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(
-                f"{self._state}: is damaged ({error!r}); give --overwrite true to start anew"
+                f"{self._journal.path}: is damaged ({error!r}); give --overwrite true to start anew"
             ) from error
-        for key in {**found, **self._request} if num_done else ():
-            if found.get(key) != self._request.get(key):
-                raise ValueError(
-                    f"{self.out} holds {num_done} scenes of an unfinished run with {key} "
-                    f"{found.get(key)!r}, not {self._request.get(key)!r}; its own command goes on, "
-                    "--overwrite true starts anew"
-                )
+        if "num" in stored and num_done <= self.num:
+            stored["num"] = self.num  # scenes are added
+        if num_done and (different := "; ".join(differences(stored, self._request))):
+            raise ValueError(
+                f"{self.out} holds {num_done} scenes of an unfinished run of another request "
+                f"({different}); the same request completes it, --overwrite true starts anew"
+            )
+        self._start_journal(num_done, evaluations)
         if num_done and not self._unfinished.exists() and self.range_path.exists():
             self.range_path.replace(self._unfinished)  # stopped between the two last files
         return num_done, evaluations
@@ -175,14 +217,14 @@ class SceneWriter:
             if (self.out / name).is_symlink():
                 raise ValueError(f"{self.out / name} is a link: remove it, or give another --out")
         written = [path for name in _WRITTEN if (path := self.out / name).exists()]
-        if written and not metadata.exists() and not self._state.exists():
+        if written and not metadata.exists() and not self._journal.path.exists():
             raise ValueError(
                 f"{written[0]} is in the way and no scenes of this command lie in {self.out}; "
                 "give another --out"
             )
         # Marks the folder as ours, should this be interrupted.
         self.out.mkdir(parents=True, exist_ok=True)
-        self._save_state(0, 0)
+        self._start_journal(0, 0)
         metadata.unlink(missing_ok=True)
         for path in (self._unfinished, *written):
             if path.is_dir():
@@ -201,7 +243,7 @@ class SceneWriter:
         size = self._unfinished.stat().st_size if self._unfinished.exists() else 0
         if self.num_done and size < end:  # to extend it would make scenes of zeros
             raise ValueError(
-                f"{self._unfinished} is gone or cut short, but {self._state} counts "
+                f"{self._unfinished} is gone or cut short, but {self._journal.path} counts "
                 f"{self.num_done} scenes: give --overwrite true to start anew"
             )
         file = FileIO(self._unfinished, "r+b" if self.num_done else "wb", opener=no_follow)
@@ -226,16 +268,12 @@ class SceneWriter:
                 if name in _CLOUD_WRITERS:
                     _CLOUD_WRITERS[name](self.out / name / f"{index:06d}.{name}", points)
             if labels is not None:
-                own = values_at_returns(labels[place], scene, self._projection)
-                write_labels(self.out / "labels" / f"{index:06d}.label", own)
-        try:
-            append(self._file, range_m.numpy().astype("<f4", copy=False).tobytes())
-        except OSError as error:
-            error.filename = str(self._unfinished)
-            raise
+                classes = values_at_returns(labels[place], scene, self._projection)
+                write_labels(self.out / "labels" / f"{index:06d}.label", classes)
+        append(self._file, range_m.numpy().astype("<f4", copy=False).tobytes())
         num_done = self.num_done + len(range_m)
         evaluations = self.evaluations + nfe * len(range_m)
-        self._save_state(num_done, evaluations)
+        self._journal.add({"num_done": num_done, "evaluations": evaluations})
         self.num_done, self.evaluations = num_done, evaluations
 
     def _wait(self) -> None:
@@ -244,6 +282,6 @@ class SceneWriter:
         if batch is not None:
             batch.result()
 
-    def _save_state(self, num_done: int, evaluations: int) -> None:
-        state = {"request": self._request, "num_done": num_done, "evaluations": evaluations}
-        write_text(self._state, json.dumps(state))
+    def _start_journal(self, num_done: int, evaluations: int) -> None:
+        about = {"request": self._request, "num_done": num_done, "evaluations": evaluations}
+        self._journal.start(about)
