@@ -14,8 +14,8 @@ from r3dpa.baselines.diffusion_paths import StepPath, inpaint
 from r3dpa.baselines.lidm import LiDM, ReleasedDDIM, released_times
 from r3dpa.baselines.lidm_first_stage import LiDMFirstStage
 from r3dpa.baselines.lidm_networks import LiDARDiscriminator, LiDMUNet, VQAutoencoder
+from r3dpa.baselines.lidm_reader import from_lidm
 from r3dpa.checkpoints import read_checkpoint
-from r3dpa.checkpoints.lidm import from_lidm
 from r3dpa.cli import main
 from r3dpa.flow.sde import ancestral, ancestral_step
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection

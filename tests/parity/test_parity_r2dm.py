@@ -28,8 +28,8 @@ from r3dpa.baselines.efficient_unet import (
     sinusoid,
 )
 from r3dpa.baselines.r2dm import R2DM, ema_decay_at
+from r3dpa.baselines.readers import unet_weights
 from r3dpa.checkpoints import read_checkpoint
-from r3dpa.checkpoints.baselines import unet_weights
 from r3dpa.flow.sde import ancestral, ancestral_step
 from r3dpa.geometry import (
     LidarSensor,

@@ -14,8 +14,8 @@ from r3dpa.baselines.diffusion import sample_errors
 from r3dpa.baselines.hdit import HDiT, _RotaryEmbedding
 from r3dpa.baselines.neighbourhood import neighbourhood_attention
 from r3dpa.baselines.r2flow import distilled_times
+from r3dpa.baselines.readers import from_r2flow, image_geometry, time_reversed, unet_weights
 from r3dpa.baselines.reflow import as_scanned
-from r3dpa.checkpoints.baselines import from_r2flow, image_geometry, time_reversed, unet_weights
 from r3dpa.flow import Interpolant, sample_time
 from r3dpa.flow.interpolant import _exponential
 from r3dpa.flow.solvers import ab3, euler

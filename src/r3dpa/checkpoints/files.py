@@ -11,6 +11,7 @@ import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,8 +22,6 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from r3dpa import __version__
-from r3dpa.checkpoints.baselines import READERS
-from r3dpa.checkpoints.lidm import from_lidm, is_lidm
 from r3dpa.checkpoints.networks import FACTS, Checkpoint, NetworkState, path_of
 from r3dpa.checkpoints.official import OURS, from_official, is_official, statistics_of, to_official
 from r3dpa.io import (
@@ -38,10 +37,14 @@ from r3dpa.pretrained import weights_file
 
 _FORMAT = "r3dpa-checkpoint-1"
 # Where a LightningModule keeps each network: beginning of its keys, name of its argument.
-_PLAIN = ("vae", "discriminator", "sit", "latent_norm", "thin_decoder")
-_LIGHTNING = {name: (f"{name}.", name) for name in _PLAIN}
-_LIGHTNING |= {"ema": ("ema.sit.", "sit"), "ema_latent_norm": ("ema.latent_norm.", "latent_norm")}
-_LIGHTNING |= {
+_LIGHTNING = {
+    "vae": ("vae.", "vae"),
+    "discriminator": ("discriminator.", "discriminator"),
+    "sit": ("sit.", "sit"),
+    "latent_norm": ("latent_norm.", "latent_norm"),
+    "thin_decoder": ("thin_decoder.", "thin_decoder"),
+    "ema": ("ema.sit.", "sit"),
+    "ema_latent_norm": ("ema.latent_norm.", "latent_norm"),
     "network": ("network.", "network"),
     "ema_network": ("ema.network.", "network"),
     "first_stage": ("first_stage.", "first_stage"),
@@ -61,7 +64,7 @@ def read_checkpoint(
     sit_args: Mapping[str, Any] | None = None,
     encoding: Literal["linear", "log2"] | None = None,
 ) -> Checkpoint:
-    """Reads a checkpoint of any layout without running code from it.
+    """Read a checkpoint of any layout without running code from it.
 
     Known are ours (``.safetensors`` with its ``.yaml``), those of Lightning (``.ckpt``), official
     ones (``.pt``), released ones of the baselines, and image VAEs of diffusers
@@ -75,8 +78,8 @@ def read_checkpoint(
         encoding: Official files only: range encoding, if the options do not name it.
 
     Raises:
-        ValueError: If the file is damaged, of no known layout, or names a class not allowed; a
-            ``FileNotFoundError`` if there is none.
+        ValueError: If the file is damaged, of no known layout, or names a class not allowed.
+        FileNotFoundError: If there is no such file.
     """
     path = weights_file(path)
     if path.suffix == ".safetensors":
@@ -85,28 +88,35 @@ def read_checkpoint(
             return _from_ours(path) if described else _from_diffusers(path)
     content = _load_pickle(path)
     with _naming(path):
-        if is_lidm(content):
-            return from_lidm(content, path, encoding)
-        if isinstance(content, dict) and "pytorch-lightning_version" in content:
-            return _from_lightning(content, path)
         if is_official(content):
             content, args = _with_neighbours(content, path)
             return from_official(content, path, args=args, sit_args=sit_args, encoding=encoding)
-        for recognised, from_baseline in READERS:
-            if recognised(content):
-                return from_baseline(content, path)
-        found = list(content)[:10] if isinstance(content, Mapping) else type(content).__name__
+        from_lightning = isinstance(content, dict) and "pytorch-lightning_version" in content
+        if not (from_lightning and "r3dpa" in content):
+            # Imported here: no file of ours needs the baselines.
+            readers = import_module("r3dpa.baselines.readers")
+            baseline: Checkpoint | None = readers.read_baseline(content, path, encoding)
+            if baseline is not None:
+                return baseline
+        if from_lightning:
+            return _from_lightning(content, path)
+        entries = list(content)[:10] if isinstance(content, Mapping) else type(content).__name__
         raise ValueError(
-            f"it holds {found}; expected a Lightning checkpoint of r3dpa, an official R3DPA "
+            f"it holds {entries}; expected a Lightning checkpoint of r3dpa, an official R3DPA "
             "checkpoint, one of a baseline, or a .safetensors file with its .yaml"
         )
 
 
 def save_checkpoint(checkpoint: Checkpoint, path: str | Path, *, overwrite: bool = False) -> Path:
-    """Writes ``<name>.safetensors`` (all weights) and ``<name>.yaml`` (everything else).
+    """Write ``<name>.safetensors`` (all weights) and ``<name>.yaml`` (everything else).
 
-    Both appear complete or not at all; the second holds the hash of the first. Files that
-    exist are a ``ValueError`` without ``overwrite``. Returns ``path``.
+    Both appear complete or not at all; the second holds the hash of the first.
+
+    Returns:
+        ``path``.
+
+    Raises:
+        ValueError: If a file exists and ``overwrite`` is not set.
     """
     path = Path(path)
     if path.suffix != ".safetensors":
@@ -139,13 +149,18 @@ def convert(
     networks: Sequence[str] | None = None,
     half: bool = False,
 ) -> str:
-    """Rewrites a checkpoint of any layout in ours, or in the official one.
+    """Convert a checkpoint of any layout to ours, or to the official one.
 
     Weights stay equal bit for bit, unless ``half`` rounds them; optimisers are left out. Official
     training checkpoints keep all facts for the way back. A checkpoint without SiT becomes the
     official VAE file with its neighbours for discriminator and latent statistics, which lose some.
-    Arguments are those of ``r3dpa convert``. Returns files, networks and what was not converted,
-    as text. What has no counterpart in the other layout, and existing files, are a ``ValueError``.
+    The arguments have the meaning that ``r3dpa convert --help`` shows.
+
+    Returns:
+        Files, networks and what was not converted, as text.
+
+    Raises:
+        ValueError: If a network has no counterpart in the other layout, or a file exists.
     """
     source, out = Path(source), Path(out)
     checkpoint = read_checkpoint(source, sit_args=sit_args, encoding=encoding)
@@ -165,7 +180,8 @@ def convert(
         rows.append((name, kind, str(len(state.state_dict)), f"{size:,}"))
     table = text_table(rows, ("network", "class", "tensors", "elements"))
     lines = [f"{source} -> {', '.join(map(str, outputs))}", table]
-    return "\n".join(lines + [f"not converted: {k} ({why})" for k, why in left_out.items()])
+    lines += [f"not converted: {name} ({reason})" for name, reason in left_out.items()]
+    return "\n".join(lines)
 
 
 def _save_official(checkpoint: Checkpoint, out: Path, overwrite: bool) -> list[Path]:
@@ -221,7 +237,7 @@ def _neighbour(vae: Path, kind: str) -> Path:
 
 @contextmanager
 def _naming(path: Path) -> Iterator[None]:
-    """Turns what a damaged file raises into a ``ValueError`` that names the file."""
+    """Turn what a damaged file raises into a ``ValueError`` that names the file."""
     try:
         yield
     except (yaml.YAMLError, SafetensorError, *UNPICKLING_ERRORS) as error:
@@ -274,8 +290,8 @@ def _from_ours(path: Path) -> Checkpoint:
         about = yaml.safe_load(description.read_text())
         if not isinstance(about, dict) or about.get("format") != _FORMAT:
             raise ValueError(f"it does not describe a {_FORMAT}")
-        kept = {key: about[key] for key in ("step", "official_args", "left_out")}
-        facts = {key: about[key] for key in FACTS if key in about}  # older files have fewer
+        facts = {key: about[key] for key in ("step", "official_args", "left_out")}
+        facts |= {key: about[key] for key in FACTS if key in about}  # older files have fewer
         configs, sha256 = dict(about["networks"]), about["sha256"]
     if sha256 != sha256_of(path):
         raise ValueError(
@@ -286,8 +302,8 @@ def _from_ours(path: Path) -> Checkpoint:
     for full_name, value in load_file(path).items():
         name, _, key = full_name.partition(".")
         weights.setdefault(name, {})[key] = value
-    networks = {name: _network(name, configs.get(name), own) for name, own in weights.items()}
-    return Checkpoint(path=path, networks=networks, **kept, **facts)
+    networks = {name: _network(name, configs.get(name), state) for name, state in weights.items()}
+    return Checkpoint(path=path, networks=networks, **facts)
 
 
 def _from_lightning(content: Mapping[str, Any], path: Path) -> Checkpoint:
@@ -295,17 +311,17 @@ def _from_lightning(content: Mapping[str, Any], path: Path) -> Checkpoint:
     arguments, about = content.get("hyper_parameters", {}), content.get("r3dpa", {})
     networks: dict[str, NetworkState] = {}
     for name, (prefix, argument) in _LIGHTNING.items():
-        own = {k.removeprefix(prefix): v for k, v in weights.items() if k.startswith(prefix)}
+        state = {k.removeprefix(prefix): v for k, v in weights.items() if k.startswith(prefix)}
         of_baseline = argument in ("network", "first_stage")  # other stages have such parts too
-        if not own or (of_baseline and argument not in arguments):
+        if not state or (of_baseline and argument not in arguments):
             continue
         config = arguments.get(argument)
-        if config is None and argument == "latent_norm" and "running_mean" in own:
+        if config is None and argument == "latent_norm" and "running_mean" in state:
             config = {
                 "class_path": "r3dpa.nn.latent_norm.LatentNorm",
-                "init_args": {"channels": len(own["running_mean"])},
+                "init_args": {"channels": len(state["running_mean"])},
             }
-        networks[name] = _network(name, config, own)
+        networks[name] = _network(name, config, state)
     prefixes = tuple(prefix for prefix, _ in _LIGHTNING.values())
     others = {key.split(".")[0] for key in weights if not key.startswith(prefixes)}
     facts = {"stage": arguments.get("_class_path", "unknown")}

@@ -4,34 +4,45 @@ from __future__ import annotations
 
 import importlib
 import inspect
-import itertools
 import reprlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
-from torch.nn.modules.module import register_module_parameter_registration_hook
-from torch.utils.hooks import RemovableHandle
 
 from r3dpa.class_paths import current_path
 from r3dpa.io import UNPICKLING_ERRORS
 
 #: Fields of a :class:`Checkpoint` that files of ours, Lightning's and official ones share.
 FACTS = (
-    *("stage", "geometry", "augmentation", "feature_source", "interpolant", "settings"),
-    *("version", "commit"),
+    "stage",
+    "geometry",
+    "augmentation",
+    "feature_source",
+    "interpolant",
+    "settings",
+    "version",
+    "commit",
 )
 
 _ALLOWED_PACKAGES = ("r3dpa.nn.", "r3dpa.features.", "r3dpa.baselines.")
 _NUM_LISTED = 10
+_LARGEST_SIDE = 2048  # of images, which no weights may have
 _AVERAGES = {"sit": "ema", "latent_norm": "ema_latent_norm"}
 # Arguments that change what the weights compute but not the shape of any weight, and the attribute
 # in which a network, or one of its layers, keeps each.
-_SHAPELESS_ARGS = {key: key for key in ("input_size", "num_heads", "alignment_depth", "eps")}
-_SHAPELESS_ARGS |= {"legacy_upsample": "legacy", "norm_groups": "num_groups", "stem": "stem"}
+_SHAPELESS_ARGS = {
+    "input_size": "input_size",
+    "num_heads": "num_heads",
+    "alignment_depth": "alignment_depth",
+    "eps": "eps",
+    "legacy_upsample": "legacy",
+    "norm_groups": "num_groups",
+    "stem": "stem",
+}
 
 
 def path_of(kind: type) -> str:
@@ -49,15 +60,13 @@ def _tuples(value: Any) -> Any:
     return tuple(_tuples(item) for item in value) if isinstance(value, list | tuple) else value
 
 
-def _at_most(count: int) -> RemovableHandle:
-    """Limits the number of parameters: a damaged file may ask for a billion layers."""
-    left = itertools.count(count, -1)
-
-    def counted(*_: Any) -> None:
-        if next(left) <= 0:
-            raise ValueError(f"more than {count} parameters, far more than its weights are")
-
-    return register_module_parameter_registration_hook(counted)
+def _numbers(value: Any) -> Iterator[int]:
+    """Whole numbers of an argument, at any depth."""
+    if isinstance(value, list | tuple):
+        for item in value:
+            yield from _numbers(item)
+    elif isinstance(value, int):
+        yield value
 
 
 @dataclass(frozen=True)
@@ -73,7 +82,11 @@ class NetworkState:
 
     @classmethod
     def of(cls, network: nn.Module, init_args: Mapping[str, Any]) -> NetworkState:
-        """State of a network built by hand; a ``ValueError`` if the arguments do not rebuild it."""
+        """State of a network built by hand.
+
+        Raises:
+            ValueError: If the arguments do not rebuild it.
+        """
         return cls(path_of(type(network)), init_args, network.state_dict()).checked()
 
     @property
@@ -83,16 +96,20 @@ class NetworkState:
 
     @property
     def kind(self) -> type[nn.Module]:
-        """The class; raises a ``ValueError`` if it is no network of this package."""
+        """The class.
+
+        Raises:
+            ValueError: If it is no network of this package.
+        """
         module_path, _, name = self.class_path.rpartition(".")
         if f"{module_path}.".startswith(_ALLOWED_PACKAGES):
             try:
-                found = getattr(importlib.import_module(module_path), name)
+                kind = getattr(importlib.import_module(module_path), name)
             except (ImportError, AttributeError) as error:
                 raise ValueError(f"class {self.class_path!r} does not exist ({error})") from None
-            is_network = isinstance(found, type) and issubclass(found, nn.Module)
-            if is_network and found.__module__.startswith(_ALLOWED_PACKAGES):
-                return found
+            is_network = isinstance(kind, type) and issubclass(kind, nn.Module)
+            if is_network and kind.__module__.startswith(_ALLOWED_PACKAGES):
+                return kind
         raise ValueError(
             f"class {self.class_path!r} is not allowed: a checkpoint may only name networks "
             "defined in r3dpa.nn, r3dpa.features or r3dpa.baselines. Edit the class_path if the "
@@ -107,7 +124,11 @@ class NetworkState:
         return defaults | {key: _tuples(value) for key, value in self.init_args.items()}
 
     def new(self) -> nn.Module:
-        """The network without the weights; a ``ValueError`` if the class refuses the arguments."""
+        """Build the network without the weights.
+
+        Raises:
+            ValueError: If the class refuses the arguments.
+        """
         kind, arguments = self.kind, {key: _tuples(value) for key, value in self.init_args.items()}
         try:
             return kind(**arguments)
@@ -118,30 +139,45 @@ class NetworkState:
             ) from error
 
     def build(self) -> nn.Module:
-        """The network with these weights, on the CPU, in training mode as constructed."""
+        """Build the network with these weights, on the CPU, in training mode as constructed."""
         network = self.new()
         self._refuse_problems(network)
         network.load_state_dict(self.state_dict, strict=True)
         return network
 
     def checked(self, name: str = "") -> NetworkState:
-        """This state; a ``ValueError`` as of :meth:`build`, but without memory for weights."""
+        """Return this state if it can be built, which is tried without memory for weights.
+
+        Raises:
+            ValueError: As :meth:`build` does.
+        """
         try:
-            with torch.device("meta"), _at_most(4 * len(self.state_dict) + 4):
+            self._refuse_huge_arguments()
+            with torch.device("meta"):
                 network = self.new()
             self._refuse_problems(network)
         except ValueError as error:
             raise ValueError(f"{name}: {error}" if name else str(error)) from error
         return self
 
+    def _refuse_huge_arguments(self) -> None:
+        """Refuse a billion layers of a damaged file before they are built."""
+        sides = (side for value in self.state_dict.values() for side in value.shape)
+        largest = max(_LARGEST_SIDE, *sides)
+        for key, value in self.init_args.items():
+            if any(number > largest for number in _numbers(value)):
+                raise ValueError(
+                    f"{key} of {self.class_path} is {value}, far more than its weights"
+                )
+
     def problems(self, network: nn.Module) -> list[str]:
         """All keys and shapes that differ between ``network`` and these weights."""
-        own, here = shapes_of(network.state_dict()), shapes_of(self.state_dict)
-        differ = [key for key in own if key in here and own[key] != here[key]]
+        wanted, given = shapes_of(network.state_dict()), shapes_of(self.state_dict)
+        differ = [key for key in wanted if key in given and wanted[key] != given[key]]
         return [
-            *(f"shape of {key}: checkpoint {here[key]}, network {own[key]}" for key in differ),
-            *(f"missing in the checkpoint: {key}" for key in own if key not in here),
-            *(f"unknown to the network: {key} {here[key]}" for key in here if key not in own),
+            *(f"shape of {key}: checkpoint {given[key]}, network {wanted[key]}" for key in differ),
+            *(f"missing in the checkpoint: {key}" for key in wanted if key not in given),
+            *(f"unknown to the network: {key} {given[key]}" for key in given if key not in wanted),
         ]
 
     def _refuse_problems(self, network: nn.Module) -> None:
@@ -182,7 +218,11 @@ class Checkpoint:
         return about
 
     def network(self, name: str) -> NetworkState:
-        """The network called ``name``; raises a ``ValueError`` if the checkpoint has none."""
+        """Return the network called ``name``.
+
+        Raises:
+            ValueError: If the checkpoint has none.
+        """
         if name not in self.networks:
             reason = f" ({self.left_out[name]})" if name in self.left_out else ""
             raise ValueError(
@@ -193,7 +233,7 @@ class Checkpoint:
 
 
 def load_into(networks: Mapping[str, nn.Module], checkpoint: Checkpoint, stage: str) -> None:
-    """Copies the weights of a checkpoint into the networks of those names, all of them or none.
+    """Copy the weights of a checkpoint into the networks of those names, all of them or none.
 
     Exported files hold averages alone, which ``sit`` and ``latent_norm`` then start from.
 

@@ -30,8 +30,9 @@ def sample(
     """Generate scenes from a checkpoint: points, range images, pictures and a page to turn.
 
     Where the checkpoint generates them, points have an intensity, and ``labels`` holds their
-    classes of KITTI-360. The same command completes an interrupted run, and with a greater ``--num``
-    adds scenes. An option that the solver does not read is an error. ``metadata.json`` holds everything needed to repeat the run.
+    classes of KITTI-360. The same command completes an interrupted run; with a greater ``--num`` it
+    adds scenes. An option that the solver does not read is an error. ``metadata.json`` holds
+    everything needed to repeat the run.
 
     Args:
         num: Number of scenes.

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
+from r3dpa.baselines.lidm_reader import from_lidm, is_lidm
 from r3dpa.checkpoints.networks import Checkpoint, NetworkState
 
 StateDict = Mapping[str, Tensor]
@@ -32,11 +33,35 @@ _UNETS = (
     (r"\.self_attn_block\.attn\.out_proj\.", ".attention.mix.proj."),
 )
 _UNET_ARGUMENTS = (
-    *("temb_channels", "channel_multiplier", "num_residual_blocks"),
-    *("gn_num_groups", "gn_eps", "attn_num_heads", "coords_encoding"),
+    "temb_channels",
+    "channel_multiplier",
+    "num_residual_blocks",
+    "gn_num_groups",
+    "gn_eps",
+    "attn_num_heads",
+    "coords_encoding",
 )
 #: Constants that are buffers there and formulas here.
 _CONSTANTS = re.compile(r"(^_dummy|\.scale|\.kernel|^coords_encoding\.(freqs|phase))$")
+
+
+def read_baseline(
+    content: Any, path: Path, encoding: Literal["linear", "log2"] | None = None
+) -> Checkpoint | None:
+    """Checkpoint from the content of a released file; None if it is of no baseline.
+
+    Args:
+        content: Content of the file.
+        path: The file.
+        encoding: Range encoding of LiDM, see :func:`from_lidm`.
+    """
+    if is_lidm(content):
+        return from_lidm(content, path, encoding)
+    if is_r2dm(content):
+        return from_r2dm(content, path)
+    if is_r2flow(content):
+        return from_r2flow(content, path)
+    return None
 
 
 def unet_weights(official: StateDict) -> dict[str, Tensor]:
@@ -105,8 +130,10 @@ _R2FLOW_FORMATS = {"logscale": "log_depth", "inverse": "inverse_depth", "metric"
 #: Last layers of the networks of R2Flow, whose sign is the direction of the velocity.
 _OUTPUTS = (
     "detokenizer.1.weight",
-    *("out_conv.weight", "out_conv.bias"),
-    *("out_conv.2.weight", "out_conv.2.bias"),
+    "out_conv.weight",
+    "out_conv.bias",
+    "out_conv.2.weight",
+    "out_conv.2.bias",
 )
 _MAX_PERIOD = 10_000.0  # of the sinusoids of the time
 
@@ -243,9 +270,3 @@ def image_geometry(
 
 def _plain(value: Any) -> Any:
     return list(value) if isinstance(value, list | tuple) else value
-
-
-#: Layouts of the baselines: how a file is recognised, and its reader.
-READERS: tuple[
-    tuple[Callable[[Any], bool], Callable[[Mapping[str, Any], Path], Checkpoint]], ...
-] = ((is_r2dm, from_r2dm), (is_r2flow, from_r2flow))
