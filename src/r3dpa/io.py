@@ -111,15 +111,16 @@ def source_commit() -> str | None:
 def machine() -> dict[str, Any]:
     """Processor, number of cores, and load."""
     cpu_info = Path("/proc/cpuinfo")
-    found = re.search(r"model name\s*: (.*)", cpu_info.read_text() if cpu_info.exists() else "")
-    cpu = found[1].strip() if found else platform.processor()
+    text = cpu_info.read_text() if cpu_info.exists() else ""
+    model = re.search(r"model name\s*: (.*)", text)
+    cpu = model[1].strip() if model else platform.processor()
     return {"cpu": cpu, "cores": os.cpu_count(), "load": round(os.getloadavg()[0], 2)}
 
 
 def versions(*packages: ModuleType) -> dict[str, str | None]:
     """Versions of r3dpa, with its commit, of Python, and of some packages."""
-    own = {"r3dpa": __version__, "commit": source_commit(), "python": platform.python_version()}
-    return own | {package.__name__: package.__version__ for package in packages}
+    ours = {"r3dpa": __version__, "commit": source_commit(), "python": platform.python_version()}
+    return ours | {package.__name__: package.__version__ for package in packages}
 
 
 def command() -> str:

@@ -347,7 +347,7 @@ def _network(name: str, config: Any, weights: Mapping[str, Tensor]) -> NetworkSt
 def _from_diffusers(path: Path) -> Checkpoint:
     """Image VAE of diffusers: sizes from the weights, number of groups from its config.json."""
     weights = {
-        _OLD_KEY.sub(lambda found: f"{found[1]}{_OLD_ATTENTION[found[2]]}.", key): value
+        _OLD_KEY.sub(lambda match: f"{match[1]}{_OLD_ATTENTION[match[2]]}.", key): value
         for key, value in load_file(path).items()
     }
     if _DIFFUSERS_KEY not in weights:
@@ -372,4 +372,4 @@ def _from_diffusers(path: Path) -> Checkpoint:
 
 
 def _count(keys: Iterable[str], pattern: str) -> int:
-    return len({found[1] for key in keys if (found := re.match(pattern, key))})
+    return len({match[1] for key in keys if (match := re.match(pattern, key))})

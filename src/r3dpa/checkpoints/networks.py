@@ -266,9 +266,9 @@ def _different_settings(state: NetworkState, network: nn.Module) -> list[str]:
     for key, attribute in _SHAPELESS_ARGS.items():
         keeper = next((m for m in network.modules() if attribute in vars(m)), None)
         if keeper is not None and key in state.arguments:
-            wanted, own = state.arguments[key], vars(keeper)[attribute]
-            if own != wanted:
-                differences.append(f"{key}: checkpoint {wanted}, network {own}")
+            there, here = state.arguments[key], vars(keeper)[attribute]
+            if here != there:
+                differences.append(f"{key}: checkpoint {there}, network {here}")
     return differences
 
 

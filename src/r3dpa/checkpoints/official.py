@@ -76,8 +76,10 @@ def from_official(
     given = sit_args or {}
     if isinstance(content.get(OURS), Mapping):
         return _from_ours(content, path, given)
-    found = content.get("args", args)
-    options = dict(vars(found) if isinstance(found, argparse.Namespace) else found or {})
+    recorded = content.get("args", args)
+    if isinstance(recorded, argparse.Namespace):
+        recorded = vars(recorded)
+    options = dict(recorded or {})
     networks: dict[str, NetworkState] = {}
     left_out: dict[str, str] = {}
     if set(content) >= _STATISTICS:
@@ -173,8 +175,10 @@ def statistics_of(norm: StateDict) -> dict[str, Tensor]:
 def _official_part(checkpoint: Checkpoint, name: str, *kinds: type[nn.Module]) -> NetworkState:
     state = checkpoint.network(name)
     if state.kind not in kinds:
-        found = f"{name} of {checkpoint.path} is a {state.class_path}"
-        raise ValueError(f"{found}, which has no official counterpart")
+        raise ValueError(
+            f"{name} of {checkpoint.path} is a {state.class_path}, which has no official "
+            "counterpart"
+        )
     return state
 
 

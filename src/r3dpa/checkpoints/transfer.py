@@ -1,4 +1,4 @@
-"""Takes over weights of another model: to start from, of RGB or fewer channels, or to guide by."""
+"""Weights of another model: to start from, of RGB or fewer channels, or to guide by."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class TransferRow(NamedTuple):
 def transfer_rgb(
     checkpoint: Checkpoint, sit: SiT, latent_norm: LatentNorm, keep_projector: bool
 ) -> list[TransferRow]:
-    """Starts a range-image SiT and its latent statistics from an RGB checkpoint.
+    """Start a range-image SiT and its latent statistics from an RGB checkpoint.
 
     ``sit`` and ``latent_norm`` are changed in place. Fresh, that is unchanged, stay: patch
     embedding, output layer and latent statistics if the number of latent channels differs, the
@@ -97,9 +97,9 @@ def with_further_channels(checkpoint: Checkpoint, vae: VAE) -> Checkpoint:
     layers = {k: v for k, v in vae.state_dict().items() if ".further_" in k}
     if not layers or any(".further_" in key for key in state.state_dict):
         return checkpoint
-    own = {"intensity": vae.intensity, "num_classes": vae.num_classes}
+    channels = {"intensity": vae.intensity, "num_classes": vae.num_classes}
     wider = replace(
-        state, init_args={**state.init_args, **own}, state_dict={**state.state_dict, **layers}
+        state, init_args={**state.init_args, **channels}, state_dict={**state.state_dict, **layers}
     )
     networks, geometry = {**checkpoint.networks, "vae": wider}, checkpoint.geometry
     if geometry is not None:
@@ -168,7 +168,7 @@ def read_snapshot(
     strong: Checkpoint,
     weights: Literal["ema", "last"] = "ema",
 ) -> WeakModel:
-    """Reads a weak model that may guide a given one.
+    """Read a weak model that may guide a given one.
 
     Both models have one VAE, which stage ``flow_matching`` freezes; normalisations that drifted
     apart are converted, up to ``NORM_TOLERANCE``.

@@ -89,28 +89,34 @@ class Augmentation:
         return View(columns if self.rotate else 0, self.flip and mirrored, grid_columns)
 
     def check_extractor(self, extractor: Any, grid_columns: int) -> None:
-        """Raise ``ValueError`` where reordered grids may not be those of the view.
+        """Refuse extractors whose reordered grids may differ from the grids of the view.
 
         Judged by ``num_headings`` and ``mirror_invariant``, see :class:`r3dpa.data.Extractor`.
+
+        Raises:
+            ValueError: Naming the option and the property that the features lack.
         """
-        wrong = {}
+        problems = {}
         if self.rotate and (getattr(extractor, "num_headings", 0) or 1) % grid_columns:
-            wrong["rotate"] = f"rotate with the scan by a {grid_columns}th of a turn"
+            problems["rotate"] = f"rotate with the scan by a {grid_columns}th of a turn"
         if self.flip and not getattr(extractor, "mirror_invariant", False):
-            wrong["flip"] = "stay the same when the scan is mirrored"
-        if wrong and not self.approximate_grids:
-            options = " and ".join(wrong)
+            problems["flip"] = "stay the same when the scan is mirrored"
+        if problems and not self.approximate_grids:
+            options = " and ".join(problems)
             name = "of an unknown extractor" if extractor is None else f"of {extractor.name!r}"
             raise ValueError(
                 f"augmentation.{options}: the features {name} are not known to "
-                f"{' or to '.join(wrong.values())}. Switch {options} off, use GeometricFeatures, "
-                "or train on the approximation with augmentation.approximate_grids: true"
+                f"{' or to '.join(problems.values())}. Switch {options} off, use "
+                "GeometricFeatures, or train on the approximation with augmentation.approximate_grids: true"
             )
 
     def check_latents(self, latent_columns: int, grid_columns: int) -> None:
-        """Raise ``ValueError`` where cached posteriors are not those of the view.
+        """Refuse views whose posteriors are no reordered cached posteriors.
 
         The encoder commutes with rotation by its column stride only, and not with mirroring.
+
+        Raises:
+            ValueError: Naming the option to switch off.
         """
         if self.flip:
             reason = "flip: the encoder of the VAE does not commute with mirroring"

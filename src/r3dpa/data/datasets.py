@@ -136,7 +136,8 @@ class PointSample(NamedTuple):
 class PointDataset(Dataset[Any]):
     """Points of each scan, prepared for a network by the loader processes.
 
-    ``ScanError`` for a scan without a point within the range limits of ``sensor``.
+    Raises:
+        ScanError: For a scan without a point within the range limits of ``sensor``.
     """
 
     scans: Sequence[Scan]

@@ -82,7 +82,11 @@ class GridSettings:
         grid_size: tuple[int, int],
         precision: str = "32-true",
     ) -> Self:
-        """Settings of an extractor; ``ValueError`` if the grid does not divide the image."""
+        """Settings of the grids of an extractor.
+
+        Raises:
+            ValueError: If the grid does not divide the range image.
+        """
         projection.sensor.cell_size(grid_size)
         wanted = _wanted(projection, extractor)
         return cls(
@@ -101,7 +105,11 @@ class GridSettings:
         )
 
     def compare(self, wanted: Mapping[str, Any], features_dir: Path) -> None:
-        """Raise ``StoreError`` where these, the stored settings, differ from the wanted ones."""
+        """Compare these, the stored settings, with the wanted ones.
+
+        Raises:
+            StoreError: Naming a value that differs.
+        """
         for key, value in wanted.items():
             if getattr(self, key) != value:
                 folder = self.store(features_dir).folder
@@ -125,8 +133,12 @@ def _made_otherwise(key: str, stored: Any, wanted: Any, folder: Path) -> StoreEr
 
 
 def stored_settings(features_dir: str | Path) -> dict[tuple[int, int], GridSettings]:
-    """Settings of the stores of a folder by grid size; ``StoreError`` if damaged."""
-    found = {}
+    """Settings of the stores of a folder by grid size.
+
+    Raises:
+        StoreError: If a file of settings is damaged.
+    """
+    stored = {}
     for path in sorted(Path(features_dir).glob("*/settings.json")):
         try:
             values = json.loads(path.read_text())
@@ -140,12 +152,16 @@ def stored_settings(features_dir: str | Path) -> dict[tuple[int, int], GridSetti
                 f"{path} is damaged ({error!r:.200}): delete {path.parent} and make its grids "
                 f"again {REMEDY}"
             ) from error
-        found[settings.grid_size] = settings
-    return found
+        stored[settings.grid_size] = settings
+    return stored
 
 
 def any_settings(features_dir: str | Path) -> GridSettings:
-    """Settings of any grids of a folder, all of one extractor; ``StoreError`` if none."""
+    """Settings of any grids of a folder, all of one extractor.
+
+    Raises:
+        StoreError: If there are none.
+    """
     stored = stored_settings(features_dir)
     if not stored:
         raise StoreError(
@@ -157,8 +173,9 @@ def any_settings(features_dir: str | Path) -> GridSettings:
 class FeatureGrids(CachedTensors[Scan]):
     """Grids ``(N, D)`` of one size (h, w), cells row by row; ``dim`` is D.
 
-    ``StoreError`` if the grid of one of ``scans`` is missing, was made with another projection or
-    extractor (any if None), or the store is damaged.
+    Raises:
+        StoreError: If the grid of one of ``scans`` is missing, was made with another projection or
+            extractor (any if None), or the store is damaged.
     """
 
     def __init__(
@@ -199,9 +216,11 @@ def plan(
 ) -> GridPlan:
     """Find the grids that are missing; arguments as for :func:`write_feature_grids`.
 
-    ``precision`` must be that of the store only where grids are missing. ``StoreError`` if there
-    are grids of other settings; ``ValueError`` if there are no grid sizes, or one does not divide
-    the range image.
+    ``precision`` counts only where grids are missing.
+
+    Raises:
+        StoreError: If there are grids of other settings.
+        ValueError: If there are no grid sizes, or one does not divide the range image.
     """
     if not grid_sizes:
         raise ValueError("grid_sizes is empty: give at least one, for example [[8, 64]]")
@@ -233,7 +252,9 @@ def pooled_grids(
 
     Returns:
         ``(B, N, D)`` float32 on the CPU for each grid size (h, w); empty cells are zero.
-        ``StoreError`` names the scan whose features are not finite.
+
+    Raises:
+        StoreError: Naming the scan whose features are not finite.
     """
     features = extractor.point_features([sample.prepared for sample in samples])
     lift = getattr(extractor, "lift", torch.nn.Identity())
@@ -241,15 +262,15 @@ def pooled_grids(
     for sample, values in zip(samples, features, strict=True):
         points = sample.points[:, :3].to(values.device)
         with torch.autocast(values.device.type, enabled=False):
-            for size, made in grids.items():
+            for size, of_size in grids.items():
                 means, _ = pool_cells(points, values, projection, size)
-                made.append(lift(means).float().cpu())
-                if not made[-1].isfinite().all():
+                of_size.append(lift(means).float().cpu())
+                if not of_size[-1].isfinite().all():
                     raise StoreError(
                         f"{sample.scan.path}: extractor {extractor.name} gave NaN or infinite "
                         "features; run it in float32 or leave this scan out"
                     )
-    return {size: torch.stack(made) for size, made in grids.items()}
+    return {size: torch.stack(of_size) for size, of_size in grids.items()}
 
 
 def write_feature_grids(
@@ -262,14 +283,26 @@ def write_feature_grids(
     workers: int = 0,
     batch_size: int = 1,
 ) -> int:
-    """Make the missing grids of ``scans`` in this process; returns the number of scans.
+    """Make the missing grids of ``scans`` in this process.
 
     Waits for another process that writes to the folder. An error or a kill costs the grids of the
     last batch only.
 
-    ``extractor`` runs where its tensors are, on ``batch_size`` scans at once; ``grid_sizes`` are
-    rows and columns (h, w); ``workers`` processes read and prepare the scans, 0 for none.
-    ``StoreError`` as for :func:`plan`, ``ScanError`` for a scan that cannot be used.
+    Args:
+        scans: Scans that need grids.
+        extractor: Feature source, which runs where its tensors are.
+        projection: Projection of the range images.
+        grid_sizes: Rows and columns (h, w) of each grid.
+        features_dir: Folder of the grids of this extractor.
+        workers: Processes that read and prepare scans, 0 for none.
+        batch_size: Scans that the extractor takes at once.
+
+    Returns:
+        Number of scans whose grids were made.
+
+    Raises:
+        StoreError: As for :func:`plan`.
+        ScanError: If a scan cannot be used.
     """
     arguments = scans, extractor, projection, grid_sizes, features_dir
     if not plan(*arguments).missing:
@@ -291,7 +324,7 @@ def write_feature_grids(
 
 @contextmanager
 def features_lock(features_dir: str | Path) -> Iterator[None]:
-    """Lock of the job that makes grids in a folder, made if missing; waits for another one."""
+    """Hold the lock of the job that makes grids in a folder; waits for another one."""
     folder = Path(features_dir)
     with writing("feature grids", folder):
         folder.mkdir(parents=True, exist_ok=True)

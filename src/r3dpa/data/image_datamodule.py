@@ -85,7 +85,7 @@ class ImageDataModule(LoaderModule):
         batch_size: Images per batch **per process**.
         num_workers: Loader processes per training process.
         seed: Seed of the order.
-        val_every: Every this many images, one is held out.
+        val_every: Hold out every n-th image.
         mirrored: Also train on the mirror image of each image. Off, as in REPA-E, which caches
             latents of centre crops as they are.
         prepare_data_per_node: Whether the processes of each node encode the images for themselves,
@@ -111,7 +111,11 @@ class ImageDataModule(LoaderModule):
         self.val_every, self.mirrored = val_every, mirrored
 
     def setup(self, stage: str) -> None:
-        """Index the images; ``ImageError`` if there are none, or a file is damaged."""
+        """Index the images.
+
+        Raises:
+            ImageError: If there are none, or a file is damaged.
+        """
         entries = self.source.entries()
         train = [entry for place, entry in enumerate(entries) if place % self.val_every]
         if self.mirrored:

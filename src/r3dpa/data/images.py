@@ -65,10 +65,18 @@ class ImageSource(ABC):
 
     @abstractmethod
     def entries(self) -> list[ImageEntry]:
-        """All images, sorted by name; ``ImageError`` if there is none, or a file is damaged."""
+        """All images, sorted by name.
+
+        Raises:
+            ImageError: If there is none, or a file is damaged.
+        """
 
     def read(self, entry: ImageEntry, size: int) -> NDArray[np.uint8]:
-        """Square image ``(S, S, 3)`` of an entry, not mirrored; ``ImageError`` names a bad file."""
+        """Square image ``(S, S, 3)`` of an entry, not mirrored.
+
+        Raises:
+            ImageError: Naming a file that is no image.
+        """
         try:
             with entry.path.open("rb") as file:
                 file.seek(entry.offset)
@@ -102,20 +110,20 @@ class ImageFolder(ImageSource):
         """All images, by their path relative to the folder: ``<shard>/<member>`` in a shard."""
         root = Path(self.root)
         base = root.parent if root.is_file() else root
-        found: list[ImageEntry] = []
+        entries: list[ImageEntry] = []
         for path in [root] if root.is_file() else files_below(root):
             name = path.relative_to(base)
             if path.suffix.lower() in _SUFFIXES:
-                found.append(_entry(path, str(name)))
+                entries.append(_entry(path, str(name)))
             elif path.suffix.lower() == ".tar":
-                found += _members(path, str(name.with_suffix("")))
-        if not found:
+                entries += _members(path, str(name.with_suffix("")))
+        if not entries:
             raise ImageError(f"{root} holds no image ({', '.join(_SUFFIXES)}), nor a .tar of them")
-        found.sort(key=lambda entry: entry.name)
-        for before, entry in pairwise(found):
+        entries.sort(key=lambda entry: entry.name)
+        for before, entry in pairwise(entries):
             if before.name == entry.name:
                 raise ImageError(f"{entry.path} holds {entry.name!r} twice: pack it again")
-        return found
+        return entries
 
 
 def _entry(path: Path, name: str) -> ImageEntry:
@@ -128,9 +136,9 @@ def _entry(path: Path, name: str) -> ImageEntry:
 
 
 def _members(shard: Path, prefix: str) -> list[ImageEntry]:
-    whole, found = _entry(shard, prefix), []
+    whole, entries = _entry(shard, prefix), []
     try:
-        # Not compressed, or nothing could be found fast.
+        # Not compressed, since members of compressed shards have no known place.
         with shard.open("rb") as data, tarfile.open(fileobj=data, mode="r:") as file:
             for member in file:
                 path = PurePath(member.name)
@@ -140,7 +148,7 @@ def _members(shard: Path, prefix: str) -> list[ImageEntry]:
                 name = f"{prefix}/{member.name.removeprefix('./')}"
                 if reason := refuse_name(name):
                     raise ImageError(f"{shard}: name of member {reason}")
-                found.append(
+                entries.append(
                     replace(whole, name=name, num_bytes=member.size, offset=member.offset_data)
                 )
             data.seek(file.offset)
@@ -151,7 +159,7 @@ def _members(shard: Path, prefix: str) -> list[ImageEntry]:
                 )
     except (tarfile.TarError, OSError) as error:
         raise ImageError(f"{shard} is no uncompressed tar file, or damaged ({error})") from error
-    return found
+    return entries
 
 
 def center_crop(image: Image.Image, size: int) -> NDArray[np.uint8]:
@@ -174,7 +182,8 @@ def center_crop(image: Image.Image, size: int) -> NDArray[np.uint8]:
 def read_mask(path: str | Path, sensor: LidarSensor) -> Tensor:
     """Mask ``(H, W)`` bool from a picture of H x W pixels: True where bright and opaque.
 
-    ``ValueError`` if the file is no picture of 8 bits a colour, or of another size.
+    Raises:
+        ValueError: If the file is no picture of 8 bits per colour, or of another size.
     """
     try:
         with Image.open(path) as picture:
@@ -186,7 +195,7 @@ def read_mask(path: str | Path, sensor: LidarSensor) -> Tensor:
                 )
             if picture.mode not in ("1", "L", "LA", "P", "RGB", "RGBA"):
                 raise ValueError(
-                    f"{path}: has pixels of type {picture.mode}; save it with 8 bits a colour"
+                    f"{path}: has pixels of type {picture.mode}; save it with 8 bits per colour"
                 )
             pixels = np.asarray(picture.convert("RGBA"))
     except (OSError, SyntaxError, Image.DecompressionBombError) as error:

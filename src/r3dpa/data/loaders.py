@@ -37,8 +37,8 @@ class EpochSampler(DistributedSampler[Any]):
         epoch = self.epoch + self.epoch_shift
         generator = np.random.default_rng((self.seed, epoch))
         order = generator.permutation(len(cast(Sized, self.dataset)))
-        own = order[self.rank : self.total_size : self.num_replicas][self.start :].tolist()
-        return iter([(epoch, index) for index in own] if self.with_epoch else own)
+        share = order[self.rank : self.total_size : self.num_replicas][self.start :].tolist()
+        return iter([(epoch, index) for index in share] if self.with_epoch else share)
 
 
 class ResumableLoader(DataLoader[Any]):
@@ -186,7 +186,11 @@ def worker_options(num_workers: int) -> dict[str, Any]:
 
 
 def at_least(least: int, **values: int | None) -> None:
-    """Raise ``ValueError`` for a named argument below its range; None passes."""
+    """Refuse named arguments below their range; None passes.
+
+    Raises:
+        ValueError: Naming the argument.
+    """
     for name, value in values.items():
         if value is not None and value < least:
             raise ValueError(f"{name} must be at least {least}, got {value}")

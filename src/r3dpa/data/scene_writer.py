@@ -49,7 +49,7 @@ _WRITTEN = (
 
 
 class SceneWriter:
-    """Writes scenes in order, in a thread; completes an interrupted run, or adds to a finished one.
+    """Writer of scenes in order, in a thread; completes interrupted runs, adds to finished ones.
 
     ======================= ===================================================================
     ``range_m.npy``         ``(num, H, W)`` float32 metres, -1 without a return

@@ -87,15 +87,23 @@ class Store:
         return self.folder / f"shard_{shard:05d}.rows"
 
     def places(self) -> dict[ItemKey, tuple[int, int]]:
-        """Shard and row of each key; ``StoreError`` if a journal is damaged."""
-        found: dict[ItemKey, tuple[int, int]] = {}
+        """Shard and row of each key.
+
+        Raises:
+            StoreError: If a journal is damaged.
+        """
+        places: dict[ItemKey, tuple[int, int]] = {}
         for path in sorted(self.folder.glob("shard_*.jsonl")):
             shard = int(path.stem.removeprefix("shard_"))
-            found.update((key, (shard, row)) for row, key in enumerate(self._keys(path)))
-        return found
+            places.update((key, (shard, row)) for row, key in enumerate(self._keys(path)))
+        return places
 
     def missing(self, items: Sequence[Item]) -> list[Item]:
-        """Items without a row; ``StoreError`` if a journal is damaged."""
+        """Items without a row.
+
+        Raises:
+            StoreError: If a journal is damaged.
+        """
         places = self.places()
         return [item for item in items if item.cache_key not in places]
 
@@ -165,7 +173,8 @@ def tensor_cache(
 class StoreWriter:
     """Appends rows to a shard of its own, the first free one from ``shard`` on; a context manager.
 
-    ``StoreError`` if the store is damaged or cannot be written.
+    Raises:
+        StoreError: If the store is damaged or cannot be written.
     """
 
     def __init__(self, store: Store, shard: int = 0) -> None:
@@ -181,8 +190,11 @@ class StoreWriter:
     def add(self, keys: Sequence[ItemKey], tensors: Tensor) -> None:
         """Append rows ``(B, *shape)`` of those keys that the store lacks, and flush them to disk.
 
-        The B keys are taken before the files are read. ``StoreError`` if the disk cannot be
-        written, or a tensor is not finite; ``ValueError`` for another shape.
+        The B keys must be taken before the files are read.
+
+        Raises:
+            StoreError: If the disk cannot be written, or a tensor is not finite.
+            ValueError: For tensors of another shape.
         """
         expected = (len(keys), *self._store.shape)
         if tuple(tensors.shape) != expected:
@@ -244,7 +256,8 @@ class StoreWriter:
 class CachedTensors(Generic[Item]):
     """Rows of a store by item, each of which must be there; safe to hand to loader processes.
 
-    ``StoreError`` if a row is missing, or the store is damaged.
+    Raises:
+        StoreError: If a row is missing, or the store is damaged.
     """
 
     def __init__(self, store: Store, items: Sequence[Item]) -> None:
@@ -258,7 +271,8 @@ class CachedTensors(Generic[Item]):
     def read(self, item: Item) -> Tensor:
         """Copy ``shape`` of the row of one item, float32, or uint8 where these are stored.
 
-        ``StoreError`` if its file was replaced since the row was made, or the store was damaged.
+        Raises:
+            StoreError: If its file was replaced since the row was made, or the store was damaged.
         """
         place = self._places.get(item.cache_key)
         if place is None:

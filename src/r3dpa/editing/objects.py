@@ -85,13 +85,17 @@ class ObjectLibrary:
         return self.features[self.names.index(name)]
 
     def check_source(self, source: str | None, dim: int) -> None:
-        """Raise ``ValueError`` where a network was aligned with another source or width."""
-        own = self.features.shape[1]
-        if source != self.source or dim != own:
+        """Refuse a network that was aligned with another source or width.
+
+        Raises:
+            ValueError: Naming both.
+        """
+        width = self.features.shape[1]
+        if source != self.source or dim != width:
             raise ValueError(
-                f"the objects have features of {self.source!r} of width {own}, but the network is "
-                f"aligned with those of {source!r} of width {dim}: make them again with `r3dpa "
-                "data objects --ckpt` for its checkpoint"
+                f"the objects have features of {self.source!r} of width {width}, but the network "
+                f"is aligned with {source!r} of width {dim}: make them again with `r3dpa data "
+                "objects --ckpt` for its checkpoint"
             )
 
     def save(self, path: str | Path) -> None:
