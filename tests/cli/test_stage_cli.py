@@ -65,6 +65,16 @@ def test_any_lightning_module_is_trained_resumed_and_evaluated(tmp_path, capsys)
         main(["validate", *arguments])
 
 
+def test_one_batch_is_no_share_of_all(capsys):
+    """Lightning takes 1 as a number of batches, and 1.0 as all of them."""
+    words = ["--trainer.limit_val_batches", "1", "--trainer.limit_train_batches", "1.0"]
+    with pytest.raises(SystemExit):
+        main(["fit", "joint", "--preset", "demo", *words, "--print_config"])
+    shown = capsys.readouterr().out
+    assert "\n  limit_val_batches: 1\n" in shown
+    assert "\n  limit_train_batches: 1.0\n" in shown
+
+
 def test_a_stage_of_range_images_needs_batches_of_them(smoke_args, tmp_path):
     more = ["--data", f"{BORING}.BoringDataModule", "--trainer.logger=false"]
     arguments = smoke_args("vae_alignment", tmp_path, *more)

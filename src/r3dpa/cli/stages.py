@@ -73,6 +73,17 @@ def _with_shipped(words: Sequence[str]) -> list[str]:
     return found
 
 
+def _prefer_whole_numbers(parser: LightningArgumentParser) -> None:
+    """Read 1 as one batch where an option is a number of batches or, as 1.0, a share of all.
+
+    Python gives ``int | float`` of Lightning's signature back as ``float | int`` where another
+    package has written that first, and the parser takes the first type that fits.
+    """
+    for action in parser._actions:
+        if getattr(action, "_typehint", None) == int | float | None:
+            action._typehint = int | float | None
+
+
 class _RecordConfig(SaveConfigCallback):
     """Writes the configuration of a training to ``run_dir`` and to wandb."""
 
@@ -132,6 +143,7 @@ class StageCLI(LightningCLI):
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
         """Adds ``run_dir``, the checkpoint callback that follows it, and the one that scores."""
+        _prefer_whole_numbers(parser)
         parser.add_argument(
             "--run_dir", type=str, default="runs/default", help="folder that the run writes to"
         )

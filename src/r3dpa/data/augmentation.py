@@ -107,7 +107,8 @@ class Augmentation:
             raise ValueError(
                 f"augmentation.{options}: the features {name} are not known to "
                 f"{' or to '.join(problems.values())}. Switch {options} off, use "
-                "GeometricFeatures, or train on the approximation with augmentation.approximate_grids: true"
+                "GeometricFeatures, or train on the approximation with "
+                "augmentation.approximate_grids: true"
             )
 
     def check_latents(self, latent_columns: int, grid_columns: int) -> None:

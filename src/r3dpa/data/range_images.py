@@ -135,25 +135,27 @@ class SimulatedImageDataModule(LidarDataModule):
 
     def prepare_data(self) -> None:
         """Simulate what is missing, and make its feature grids."""
-        train, val, projection = self._scans_and_projection()
+        train, val = self.limited_split()
+        images: list[Any] = sorted(train + val)
+        projection = SphericalProjection(self.sensor)
         grids = None
         if self.features_dir is not None and self.extractor is not None:
             extractor = cast(Extractor, self.extractor.eval())
             settings = GridSettings.of(extractor, projection, self.grid_size)
             grids = settings.store(self.features_dir)
         with only_writer(Path(self.root) / ".lock", f"simulates into {self.root}", wait=True):
-            missing = set(self._store.missing(train + val))
+            missing = set(self._store.missing(images))
             if grids is not None:
-                missing |= set(grids.missing(train + val))
+                missing |= set(grids.missing(images))
             if missing:
                 self._simulate(sorted(missing), projection, grids)
 
     @cached_property
     def images(self) -> CachedPixels:
         """Cached images of all scans."""
-        train, val, _ = self._scans_and_projection()
-        rows: CachedTensors[SimulatedImage] = CachedTensors(self._store, sorted(train + val))
-        return CachedPixels(rows, self.sensor.range_max_m)
+        train, val = self.limited_split()
+        images: list[Any] = sorted(train + val)
+        return CachedPixels(CachedTensors(self._store, images), self.sensor.range_max_m)
 
     def points(self, scan: Any) -> Tensor:
         """Points ``(P, 3)`` at the centres of the pixels."""
