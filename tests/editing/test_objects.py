@@ -154,7 +154,7 @@ def test_other_objects_and_features_of_another_source_are_refused(library):
         library.feature("tram")
     library.check_source("scaled", 4)
     for source, dim in (("scalr", 4), (None, 4), ("scaled", 768)):
-        with pytest.raises(ValueError, match=f"of 'scaled' of width 4, .* with {source!r} of width"):
+        with pytest.raises(ValueError, match=f"'scaled' of width 4, .* with {source!r} of width"):
             library.check_source(source, dim)
 
 

@@ -17,7 +17,7 @@ from r3dpa.baselines.stages import scene_generator
 from r3dpa.checkpoints import read_checkpoint, weights_sha256
 from r3dpa.data.loader_module import LoaderModule
 from r3dpa.data.loaders import at_least
-from r3dpa.data.posterior_cache import filled
+from r3dpa.data.posterior_cache import fill_cache
 from r3dpa.data.store import CachedTensors, ItemKey, Store, tensor_cache
 from r3dpa.flow.noise import scene_noise
 from r3dpa.flow.sampler import SamplerConfig
@@ -90,7 +90,7 @@ class ReflowPairs(LoaderModule):
     def setup(self, stage: str) -> None:
         """Generates the scenes that are missing, and opens the cache."""
         store, pairs = self._store()
-        images = filled(self.trainer, store, pairs, self._generated)
+        images = fill_cache(self.trainer, store, pairs, self._generated)
         split = len(pairs) - self.num_held_out
         self.train_set = PairDataset(pairs[:split], images)
         self.val_set = PairDataset(pairs[split:], images)

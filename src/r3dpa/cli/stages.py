@@ -79,7 +79,8 @@ def _prefer_whole_numbers(parser: LightningArgumentParser) -> None:
     Python gives ``int | float`` of Lightning's signature back as ``float | int`` where another
     package has written that first, and the parser takes the first type that fits.
     """
-    for action in parser._actions:
+    actions: list[Any] = parser._actions
+    for action in actions:
         if getattr(action, "_typehint", None) == int | float | None:
             action._typehint = int | float | None
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -20,7 +20,7 @@ from lidarsim.faults import Fault, Kind
 from lidarsim.recorded import Instrument, RecordedScan
 from lidarsim.weather import Weather, WeatheredScan, changed_cloud, recorded_scan
 from r3dpa.cli.parser import check_folder
-from r3dpa.io import delete_unfinished, differences, in_processes, no_follow, only_writer
+from r3dpa.io import Journal, delete_unfinished, differences, in_processes, only_writer
 
 _REQUEST, _LINES, _REPORT, _PAGE = "request.json", ".unfinished.jsonl", "report.jsonl", "scans.html"
 _LOST, _MOVED = 254, 255  # colours of the page, beside those of Origin
@@ -162,26 +162,23 @@ def _run(source: Path, change: Any, request: dict[str, Any], options: FolderOpti
     _check_out(root, out, files, json.loads(json.dumps(request)))
     with only_writer(out / ".lock", f"writes scans to {out}", wait=True):
         write(out / _REQUEST, to_json(request))
-        lines = {
-            name: line for name, line in _lines(out) if name in paths or (out / name).is_file()
-        }
+        lines = _lines(out)
+        for name in [name for name in lines if name not in paths and not (out / name).is_file()]:
+            del lines[name]
         for name in lines.keys() & paths.keys():
             if not _is_done(lines[name], inputs_of(paths[name], root), out):
                 _delete_results(lines.pop(name), out)
         todo = [path for name, path in paths.items() if name not in lines]
         num_done = len(paths) - len(todo)
-        with (
-            open(out / _LINES, "a", opener=no_follow) as unfinished,
-            tqdm(total=len(paths), initial=num_done, unit="scan", disable=None) as bar,
-        ):
+        journal, report = Journal(out / _LINES), Journal(out / _REPORT)
+        journal.start(*journal.read())  # without an incomplete last line
+        with tqdm(total=len(paths), initial=num_done, unit="scan", disable=None) as bar:
             for line in in_processes(job, todo, options.workers):
                 lines[line["scan"]] = line
-                unfinished.write(json.dumps(line) + "\n")
-                unfinished.flush()
+                journal.add(line)
                 bar.update()
-        text = "".join(f"{json.dumps(lines[name])}\n" for name in sorted(lines))
-        write(out / _REPORT, text.encode())
-        (out / _LINES).unlink()
+        report.start(*(lines[name] for name in sorted(lines)))
+        journal.delete()
         delete_unfinished(out)  # at the end: workers of a killed run may outlive it
         bad = [lines[name]["error"] for name in paths if "error" in lines[name]]
         has_results = len(bad) < len(lines)
@@ -216,7 +213,7 @@ def _check_out(root: Path, out: Path, files: list[Path], request: dict[str, Any]
             )
     elif out.is_dir() and any(out.iterdir()):
         raise ValueError(f"{out} holds other files: give a new folder as --out")
-    earlier = {root / name: out / name for name, _ in _lines(out) if (out / name).is_file()}
+    earlier = {root / name: out / name for name in _lines(out) if (out / name).is_file()}
     if gone := [result for path, result in earlier.items() if not path.is_file()]:
         raise ValueError(
             f"{out} holds results of {len(gone)} scans that {root} does not hold any more, such as "
@@ -225,13 +222,18 @@ def _check_out(root: Path, out: Path, files: list[Path], request: dict[str, Any]
     refuse_shared_labels({*files, *earlier})
 
 
-def _lines(out: Path) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Lines of earlier runs; the last one of a killed run may be torn."""
+def _lines(out: Path) -> dict[str, dict[str, Any]]:
+    """Lines of earlier runs by scan."""
+    lines: dict[str, dict[str, Any]] = {}
     for path in (out / _REPORT, out / _LINES):
-        for text in path.read_text().splitlines() if path.is_file() else ():
-            with suppress(ValueError):
-                line = json.loads(text)
-                yield line["scan"], line
+        try:
+            lines |= {line["scan"]: line for line in Journal(path).read()}
+        except (ValueError, TypeError, KeyError) as error:
+            raise ValueError(
+                f"{path} is damaged ({error}): delete it, and repeat the command to make its scans "
+                "again"
+            ) from error
+    return lines
 
 
 def _is_done(line: dict[str, Any], inputs: dict[str, list[int]], out: Path) -> bool:

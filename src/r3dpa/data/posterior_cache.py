@@ -1,4 +1,4 @@
-"""Caches that the processes of a training fill together: VAE posteriors of the training set."""
+"""Caches that the processes of a training fill together, above all of VAE posteriors."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Item = TypeVar("Item", bound=Cacheable)
 
 
 @torch.no_grad()
-def encoded_once(
+def cache_posteriors(
     module: Any,
     root: Path,
     settings: Mapping[str, Any],
@@ -27,7 +27,7 @@ def encoded_once(
     dataset_of: Callable[[list[Item]], Dataset[Any]],
     image: str,
 ) -> CachedTensors[Item]:
-    """Posterior moments ``(2C, h, w)`` of items; only those that the cache lacks are encoded.
+    """Cache posterior moments ``(2C, h, w)``; encodes only the items that the cache lacks.
 
     They are computed in float32 whatever the precision of the steps.
 
@@ -47,39 +47,46 @@ def encoded_once(
     about = {**settings, "vae": weights_sha256(module.vae.state_dict())}
     cache = tensor_cache(root, "posterior", about, (2 * channels, *size))
 
-    def moments(own: list[Item]) -> Iterator[Tensor]:
-        loader = plain_loader(dataset_of(own), datamodule.batch_size, datamodule.num_workers)
+    def moments_of(some: list[Item]) -> Iterator[Tensor]:
+        loader = plain_loader(dataset_of(some), datamodule.batch_size, datamodule.num_workers)
         for batch in loader:
             posterior = module.vae.encode(batch[image].to(module.device))
             yield torch.cat([posterior.mean, posterior.logvar], dim=1)
 
-    return filled(module.trainer, cache, items, moments)
+    return fill_cache(module.trainer, cache, items, moments_of)
 
 
-def filled(
+def fill_cache(
     trainer: Any,
     cache: Store,
     items: Sequence[Item],
     rows_of: Callable[[list[Item]], Iterator[Tensor]],
 ) -> CachedTensors[Item]:
-    """The cache with a row for each item; ``rows_of`` yields rows ``(B, ...)`` of some in order.
+    """Make the missing rows of a cache; all processes of a training call it and share the work.
 
-    All processes of a training call it with the same items, and share the work.
+    Args:
+        trainer: Trainer of the process.
+        cache: Store with a row for each item.
+        items: Items, the same in all processes.
+        rows_of: Yields rows ``(B, ...)`` of some items in order.
+
+    Returns:
+        Reader of the complete cache.
     """
     missing = cache.missing(items)
     trainer.strategy.barrier("cached tensors: all have looked")
     # Where each node has a disk of its own, its processes make everything.
     if trainer.datamodule.prepare_data_per_node:
-        own = missing[trainer.local_rank :: trainer.num_devices]
+        share = missing[trainer.local_rank :: trainer.num_devices]
     else:
-        own = missing[trainer.global_rank :: trainer.world_size]
-    if own:
+        share = missing[trainer.global_rank :: trainer.world_size]
+    if share:
         rank_zero_info(f"making {len(missing)} of {len(items)} once, into {cache.folder}")
-        keys = [item.cache_key for item in own]
-        done = 0
+        keys = [item.cache_key for item in share]
+        num_done = 0
         with cache.writer(trainer.global_rank) as writer:
-            for rows in rows_of(own):
-                writer.add(keys[done : done + len(rows)], rows)
-                done += len(rows)
+            for rows in rows_of(share):
+                writer.add(keys[num_done : num_done + len(rows)], rows)
+                num_done += len(rows)
     trainer.strategy.barrier("cached tensors: all are written")
     return CachedTensors(cache, items)

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from r3dpa import losses
 from r3dpa.checkpoints import Checkpoint, weights_sha256
 from r3dpa.data.datasets import LidarBatch
-from r3dpa.data.posterior_cache import filled
+from r3dpa.data.posterior_cache import fill_cache
 from r3dpa.data.store import CachedTensors, ItemKey, tensor_cache
 from r3dpa.flow import ab3, average_times, average_velocity_steps, ode_times
 from r3dpa.flow.average_velocity import AVERAGE_STEPS, TIME_SHIFT
@@ -149,7 +149,7 @@ class FewStep(FlowMatching):
                     rows = self.solve(indices)
                 yield rows
 
-        self._cached = filled(trainer, cache, items, points)
+        self._cached = fill_cache(trainer, cache, items, points)
 
     @torch.no_grad()
     def solve(self, indices: list[int]) -> Tensor:

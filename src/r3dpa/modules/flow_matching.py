@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.data.datasets import LidarBatch
-from r3dpa.data.posterior_cache import encoded_once
+from r3dpa.data.posterior_cache import cache_posteriors
 from r3dpa.modules.base import GenerativeModule
 from r3dpa.modules.settings import LossWeights
 from r3dpa.modules.steps import PathDraws
@@ -99,7 +99,7 @@ class FlowMatching(GenerativeModule):
             return
         dataset = self._datamodule.train_set
         geometry = self.scan_geometry.to_dict()
-        posteriors = encoded_once(
+        posteriors = cache_posteriors(
             self,
             Path(self.latents_dir or Path(self.trainer.default_root_dir) / "latents"),
             {"projection": geometry["projection"], "codec": geometry["codec"]},

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from r3dpa.checkpoints import load_into, read_checkpoint
 from r3dpa.data.image_datamodule import ImageBatch, ImageDataset, latent_statistics
 from r3dpa.data.images import ImageEntry
-from r3dpa.data.posterior_cache import encoded_once
+from r3dpa.data.posterior_cache import cache_posteriors
 from r3dpa.data.store import CachedTensors
 from r3dpa.features import DINOv2
 from r3dpa.modules import steps
@@ -130,7 +130,7 @@ class RGBPretraining(ImageStage):
         if cast(Any, trainer).fast_dev_run:
             batches = int(trainer.limit_train_batches)
             entries = entries[: batches * datamodule.batch_size * trainer.world_size]
-        return encoded_once(
+        return cache_posteriors(
             self,
             Path(self.latents_dir or Path(trainer.default_root_dir) / "latents"),
             {"images": datamodule.settings},
