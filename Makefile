@@ -14,10 +14,10 @@ SCRATCH ?=
 OUT ?= runs/demo
 ifneq ($(SCRATCH),)
 ifeq ($(DATA),)
-SOURCE := --config conf/data/demo.yaml --data.init_args.root $(OUT)/data
+SOURCE := --config conf/data/demo.yaml --data.init_args.root '$(OUT)/data'
 else
-SOURCE := --config conf/data/demo_folder.yaml --data.init_args.scans $(DATA) \
-	--data.init_args.features_dir $(OUT)/feature_grids
+SOURCE := --config conf/data/demo_folder.yaml --data.init_args.scans '$(DATA)' \
+	--data.init_args.features_dir '$(OUT)/feature_grids'
 endif
 FIT := $(BIN)/r3dpa fit --config conf/trainer.yaml --config conf/demo/trainer.yaml $(SOURCE)
 else
@@ -25,7 +25,7 @@ ifeq ($(DATA),)
 SOURCE := --config conf/r3dpa_s/demo_data.yaml
 REAL := conf/r3dpa_s/demo_data.yaml
 else
-SOURCE := --config conf/r3dpa_s/demo_folder.yaml --data.init_args.scans $(DATA)
+SOURCE := --config conf/r3dpa_s/demo_folder.yaml --data.init_args.scans '$(DATA)'
 REAL := $(DATA)
 endif
 FIT := $(BIN)/r3dpa fit --config conf/trainer.yaml --config conf/r3dpa_s/trainer.yaml $(SOURCE)
@@ -86,34 +86,34 @@ notebooks: $(READY) ## run the notebooks, keeping their outputs
 
 ifneq ($(SCRATCH),)
 demo: $(READY) ## the weights of the package, then trained on: make demo [DATA=folder of .bin scans] [SCRATCH=1]
-	rm -rf $(OUT)/vae_alignment $(OUT)/joint
+	rm -rf '$(OUT)/vae_alignment' '$(OUT)/joint'
 	$(FIT) --config conf/experiment/vae_alignment.yaml \
-		--config conf/demo/vae_alignment.yaml --run_dir $(OUT)/vae_alignment
+		--config conf/demo/vae_alignment.yaml --run_dir '$(OUT)/vae_alignment'
 	$(FIT) --config conf/experiment/joint.yaml --config conf/demo/joint.yaml \
-		--run_dir $(OUT)/joint \
-		--model.init_args.init_from $(OUT)/vae_alignment/checkpoints/last.ckpt
-	$(BIN)/r3dpa sample --ckpt $(OUT)/joint/checkpoints/last.ckpt --out $(OUT)/scenes \
+		--run_dir '$(OUT)/joint' \
+		--model.init_args.init_from '$(OUT)/vae_alignment/checkpoints/last.ckpt'
+	$(BIN)/r3dpa sample --ckpt '$(OUT)/joint/checkpoints/last.ckpt' --out '$(OUT)/scenes' \
 		--num 16 --steps 64 --batch_size 16 --overwrite true
-	$(BIN)/r3dpa report $(OUT)/vae_alignment
-	$(BIN)/r3dpa report $(OUT)/joint
-	$(BIN)/r3dpa test --config $(OUT)/joint/config.yaml \
-		--ckpt_path $(OUT)/joint/checkpoints/last.ckpt
+	$(BIN)/r3dpa report '$(OUT)/vae_alignment'
+	$(BIN)/r3dpa report '$(OUT)/joint'
+	$(BIN)/r3dpa test --config '$(OUT)/joint/config.yaml' \
+		--ckpt_path '$(OUT)/joint/checkpoints/last.ckpt'
 else
 demo: $(READY)
-	rm -rf $(OUT)/vae $(OUT)/flow $(OUT)/reference.safetensors
-	$(BIN)/r3dpa sample --num 16 --out $(OUT)/r3dpa-s --overwrite true
-	$(BIN)/r3dpa edit inpaint --scan $(OUT)/r3dpa-s/bin/000000.bin --box -30 30 -25 3 --num 2 \
-		--steps 16 --out $(OUT)/edit --overwrite true
-	$(BIN)/r3dpa data reference --data $(REAL) --limit 32 --out $(OUT)/reference.safetensors
-	$(BIN)/r3dpa evaluate --samples $(OUT)/r3dpa-s --reference $(OUT)/reference.safetensors \
-		--allow_few --label before --out $(OUT)/before
-	$(FIT) --config conf/r3dpa_s/vae_alignment.yaml --config conf/r3dpa_s/demo_vae.yaml --run_dir $(OUT)/vae
+	rm -rf '$(OUT)/vae' '$(OUT)/flow' '$(OUT)/reference.safetensors'
+	$(BIN)/r3dpa sample --num 16 --out '$(OUT)/r3dpa-s' --overwrite true
+	$(BIN)/r3dpa edit inpaint --scan '$(OUT)/r3dpa-s/bin/000000.bin' --box -30 30 -25 3 --num 2 \
+		--steps 16 --out '$(OUT)/edit' --overwrite true
+	$(BIN)/r3dpa data reference --data '$(REAL)' --limit 32 --out '$(OUT)/reference.safetensors'
+	$(BIN)/r3dpa evaluate --samples '$(OUT)/r3dpa-s' --reference '$(OUT)/reference.safetensors' \
+		--allow_few --label before --out '$(OUT)/before'
+	$(FIT) --config conf/r3dpa_s/vae_alignment.yaml --config conf/r3dpa_s/demo_vae.yaml --run_dir '$(OUT)/vae'
 	$(FIT) --config conf/r3dpa_s/flow_matching.yaml --config conf/r3dpa_s/demo_flow.yaml \
-		--run_dir $(OUT)/flow --model.init_args.init_from $(OUT)/vae/checkpoints/last.ckpt
-	$(BIN)/r3dpa sample --ckpt $(OUT)/flow/checkpoints/last.ckpt --num 16 --out $(OUT)/scenes \
+		--run_dir '$(OUT)/flow' --model.init_args.init_from '$(OUT)/vae/checkpoints/last.ckpt'
+	$(BIN)/r3dpa sample --ckpt '$(OUT)/flow/checkpoints/last.ckpt' --num 16 --out '$(OUT)/scenes' \
 		--overwrite true
-	$(BIN)/r3dpa evaluate --samples $(OUT)/scenes --reference $(OUT)/reference.safetensors \
-		--allow_few --label after --beside $(OUT)/before/evaluation.json --out $(OUT)/after
+	$(BIN)/r3dpa evaluate --samples '$(OUT)/scenes' --reference '$(OUT)/reference.safetensors' \
+		--allow_few --label after --beside '$(OUT)/before/evaluation.json' --out '$(OUT)/after'
 endif
 
 gallery: $(READY) ## one page of 64 scenes in order, their nearest training scans, edits, weather
