@@ -8,7 +8,7 @@ import pytest
 import torch
 from tiny_stages import TinyData, stage_module
 
-from r3dpa.data.posterior_cache import encoded_once
+from r3dpa.data.posterior_cache import cache_posteriors
 from r3dpa.modules import FlowMatching, flow_matching
 
 
@@ -37,7 +37,7 @@ def encode(tmp_path):
 
     def run(vae, settings, given):
         module.vae = vae
-        cached = encoded_once(module, tmp_path, settings, given, Images, "image")
+        cached = cache_posteriors(module, tmp_path, settings, given, Images, "image")
         rows = list(tmp_path.glob("*/*.rows"))
         return torch.stack([cached.read(item) for item in given]), len(rows)
 
@@ -64,7 +64,7 @@ def test_the_key_knows_weights_settings_and_files(encode):
 
 def test_posteriors_of_scans_depend_on_projection_and_codec(monkeypatch, tmp_path):
     found = []
-    monkeypatch.setattr(flow_matching, "encoded_once", lambda *args: found.append(args))
+    monkeypatch.setattr(flow_matching, "cache_posteriors", lambda *args: found.append(args))
     module = stage_module("flow_matching", cache_latents=True)
     module.geometry = TinyData.geometry
     data = SimpleNamespace(train_set=SimpleNamespace(scans=[]), use_posteriors=lambda _: None)
