@@ -199,8 +199,14 @@ class LidarDataModule(LoaderModule):
             return
         train, val, projection = self._scans_and_projection()
         extractor = cast(Extractor, self.extractor.eval())
-        arguments = train + val, extractor, projection, [self.grid_size], self.features_dir
-        num_made = write_feature_grids(*arguments, workers=self.num_workers)
+        num_made = write_feature_grids(
+            train + val,
+            extractor,
+            projection,
+            [self.grid_size],
+            self.features_dir,
+            workers=self.num_workers,
+        )
         rank_zero_info(f"feature grids: {num_made} made, in {self.features_dir}")
 
     def setup(self, stage: str) -> None:
@@ -209,8 +215,9 @@ class LidarDataModule(LoaderModule):
         scans, grids = sorted(train + val), None
         if self.features_dir is not None and stage != "predict":
             extractor = cast(Extractor | None, self.extractor)
-            arguments = self.features_dir, scans, self.projection, self.grid_size, extractor
-            grids = FeatureGrids(*arguments)
+            grids = FeatureGrids(
+                self.features_dir, scans, self.projection, self.grid_size, extractor
+            )
         self.train_set, self.val_set, self.all_set = (
             LidarDataset(split, self.projection, self.codec, grids, images=self.images)
             for split in (train, val, scans)

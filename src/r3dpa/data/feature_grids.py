@@ -304,11 +304,11 @@ def write_feature_grids(
         StoreError: As for :func:`plan`.
         ScanError: If a scan cannot be used.
     """
-    arguments = scans, extractor, projection, grid_sizes, features_dir
-    if not plan(*arguments).missing:
+    if not plan(scans, extractor, projection, grid_sizes, features_dir).missing:
         return 0  # complete grids may lie on a read-only disk
     with features_lock(features_dir):
-        todo = plan(*arguments)  # another process may have made some
+        # Again, since another process may have made some.
+        todo = plan(scans, extractor, projection, grid_sizes, features_dir)
         dataset = PointDataset(todo.missing, projection.sensor, extractor.prepare)
         loader = plain_loader(dataset, batch_size, workers, collate_fn=list)
         with ExitStack() as stack:
