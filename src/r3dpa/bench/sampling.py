@@ -30,7 +30,7 @@ from r3dpa.checkpoints import read_checkpoint
 from r3dpa.flow.average_velocity import AVERAGE_STEPS
 from r3dpa.flow.sampler import SamplerConfig, Solver
 from r3dpa.flow.solvers import steps_for
-from r3dpa.io import atomic_path, command, differences, machine, usable_device, versions
+from r3dpa.io import atomic_path, command, machine, usable_device, versions
 
 #: Solvers with the shift of their grids.
 _SOLVERS: tuple[tuple[Solver, float], ...] = (
@@ -74,11 +74,10 @@ class Work:
     def __init__(self, folder: Path | None = None, request: Any = None) -> None:
         self.folder = folder
         text = json.dumps(request)
-        stored = json.loads(self.piece("request", lambda: text))
-        if different := "; ".join(differences(stored, json.loads(text))):
+        if self.piece("request", lambda: text) != text:
             raise ValueError(
-                f"{folder} holds unfinished work of another request ({different}): repeat the same "
-                "command to complete it, or delete the folder"
+                f"{folder} holds unfinished work of other options or another checkpoint: repeat "
+                "the same command to continue it, or delete the folder"
             )
 
     def piece(self, name: str, make: Callable[[], Any]) -> Any:
