@@ -21,6 +21,7 @@ __all__ = [
     "generator_loss",
     "masked_mean",
     "pixel_error",
+    "reconstruction_errors",
     "reconstruction_loss",
     "return_loss",
 ]
@@ -50,6 +51,14 @@ def reconstruction_loss(
     if kind == "l2":
         return F.mse_loss(reconstruction.float(), image.float())
     raise ValueError(f"reconstruction loss must be 'l1' or 'l2', got {kind!r}")
+
+
+def reconstruction_errors(
+    reconstruction: Tensor, image: Tensor, kind: Literal["l1", "l2"] = "l1"
+) -> Tensor:
+    """:func:`reconstruction_loss` ``(B,)`` of each image."""
+    pairs = zip(reconstruction.split(1), image.split(1), strict=True)
+    return torch.stack([reconstruction_loss(*pair, kind) for pair in pairs])
 
 
 def pixel_error(prediction: Tensor, image: Tensor, kind: Literal["l1", "l2"] = "l1") -> Tensor:

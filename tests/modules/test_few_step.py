@@ -9,7 +9,7 @@ from tiny_stages import ARGUMENTS, QUIET, Observed, TinyData, stage_module, tiny
 from r3dpa.checkpoints import load_into, read_checkpoint
 from r3dpa.flow import average_times
 from r3dpa.modules import FewStep, few_step
-from r3dpa.modules.steps import PathDraws
+from r3dpa.modules.stage import PathDraws
 from r3dpa.nn import VAE, SiT, ThinDecoder
 
 pytestmark = QUIET

@@ -14,7 +14,6 @@ from tiny_stages import QUIET, SILENT, TinyData, stage_module
 from torch.utils.data import DataLoader
 
 from r3dpa.data.loaders import LoaderModule
-from r3dpa.modules import steps
 
 pytestmark = [
     *QUIET,
@@ -64,7 +63,7 @@ def test_the_average_is_evaluated_where_there_is_one(tmp_path):
         for weight in module.ema.parameters():
             weight.mul_(1.5)
     logged = validated(module, data, tmp_path)
-    draws = steps.draw_held_out(module, torch.arange(4))
+    draws = module.draw_held_out(torch.arange(4))
     losses = {}
     for name, networks in (("average", module.ema), ("last", module)):
         with torch.no_grad():

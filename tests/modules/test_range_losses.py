@@ -13,8 +13,8 @@ from r3dpa.checkpoints import read_checkpoint
 from r3dpa.geometry import NUM_CLASSES, RangeCodec, ScanGeometry, SphericalProjection
 from r3dpa.losses import centred_features, class_errors, masked_mean, return_loss
 from r3dpa.modules import LossWeights, OptimizerConfig, VAEAlignment
-from r3dpa.modules.checks import check_image
-from r3dpa.modules.steps import PathDraws
+from r3dpa.modules.base import check_image
+from r3dpa.modules.stage import PathDraws
 from r3dpa.nn import VAE, PatchDiscriminator, SiT
 
 pytestmark = QUIET

@@ -20,10 +20,9 @@ from r3dpa.data.store import CachedTensors, ItemKey, tensor_cache
 from r3dpa.flow import ab3, average_times, average_velocity_steps, ode_times
 from r3dpa.flow.average_velocity import AVERAGE_STEPS, TIME_SHIFT
 from r3dpa.flow.times import per_sample
-from r3dpa.modules import steps
 from r3dpa.modules.flow_matching import FlowMatching
 from r3dpa.modules.settings import TimeSampling
-from r3dpa.modules.steps import PathDraws, batch_number
+from r3dpa.modules.stage import PathDraws, zero_loss
 from r3dpa.nn import VAE, SiT, ThinDecoder
 from r3dpa.nn.layers import num_processes
 
@@ -179,7 +178,7 @@ class FewStep(FlowMatching):
         ``time``, uniform in [0, 1), selects two of the points.
         """
         draws = super().draw_path(num_samples, number)
-        number = batch_number(self) if number is None else number
+        number = self.batch_number if number is None else number
         world = self.trainer.world_size
         first = number * num_samples * world + self.global_rank
         indices = [(first + i * world) % self.trajectories for i in range(num_samples)]
@@ -235,7 +234,7 @@ class FewStep(FlowMatching):
         world = num_processes()
         part = [z for i, z in enumerate(latents) if (self.global_rank + i * world) % _DECODED == 0]
         if not part:
-            return {"reconstruction": steps.zero_loss(self.thin_decoder)}
+            return {"reconstruction": zero_loss(self.thin_decoder)}
         with torch.no_grad():
             image = self.vae.decode(torch.stack(part))
         found = self.reconstruction_losses(image, self.thin_decoder.predict(torch.stack(part)))

@@ -14,7 +14,7 @@ from r3dpa.data.datasets import LidarBatch
 from r3dpa.data.posterior_cache import encoded_once
 from r3dpa.modules.base import GenerativeModule
 from r3dpa.modules.settings import LossWeights
-from r3dpa.modules.steps import PathDraws
+from r3dpa.modules.stage import PathDraws
 from r3dpa.nn import VAE, Posterior, VelocityNetwork
 
 
@@ -54,7 +54,8 @@ class FlowMatching(GenerativeModule):
         **kwargs: Any,
     ) -> None:
         super().__init__(vae, sit, weights=weights, **kwargs)
-        self.cache_latents, self.latents_dir = cache_latents, latents_dir
+        self.cache_latents = cache_latents
+        self.latents_dir = latents_dir
         self.vae.requires_grad_(False)
         self.sit.projector.requires_grad_(self.weights.sit_alignment != 0)
 
@@ -121,7 +122,8 @@ class FlowMatching(GenerativeModule):
         """One step on range images or posteriors, and feature grids ``(B, N, D)``."""
         latents, draws = self.draw_latents(batch)
         normalised = self.latent_norm.normalise(latents)
-        return self.weigh_and_log(self.flow_losses(normalised, batch.get("feature_grid"), draws))
+        losses = self.flow_losses(self.sit, normalised, batch.get("feature_grid"), draws)
+        return self.weigh_and_log(losses)
 
     @torch.no_grad()
     def draw_latents(self, batch: LidarBatch) -> tuple[Tensor, PathDraws]:
