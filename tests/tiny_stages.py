@@ -14,7 +14,7 @@ from torch.utils.data import DataLoader
 from r3dpa.callbacks import StepGuard
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
 from r3dpa.modules import FewStep, FlowMatching, JointAlignment, VAEAlignment
-from r3dpa.nn import VAE, PatchDiscriminator, SiT, ThinDecoder
+from r3dpa.nn import VAE, AverageVelocitySiT, PatchDiscriminator, SiT, ThinDecoder
 
 # Only `r3dpa fit` saves plain arguments in place of networks; nothing is saved here.
 QUIET = [
@@ -126,7 +126,8 @@ ARGUMENTS = {
 
 
 def tiny_sit(**more):
-    return SiT(**ARGUMENTS["sit"] | more)
+    kind = AverageVelocitySiT if "average_blocks" in more else SiT
+    return kind(**ARGUMENTS["sit"] | more)
 
 
 def stage_module(stage, sit=tiny_sit, **kwargs):

@@ -15,6 +15,7 @@ from tiny_stages import (
 
 from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint
 from r3dpa.cli.replay import replay
+from r3dpa.nn import AverageVelocitySiT
 
 pytestmark = QUIET
 
@@ -24,7 +25,7 @@ def save(module, path):
     for name, arguments in ARGUMENTS.items():
         network = getattr(module, name, None)
         if network is not None:
-            if name == "sit" and network.average is not None:
+            if isinstance(network, AverageVelocitySiT):
                 arguments = arguments | {"average_blocks": len(network.average.blocks)}
             networks[name] = NetworkState.of(network, arguments)
     save_checkpoint(Checkpoint(path, module.stage, networks), path)

@@ -21,8 +21,7 @@ from tiny_stages import (
     train,
 )
 
-from r3dpa.callbacks import StepGuard
-from r3dpa.callbacks import bad_batches
+from r3dpa.callbacks import StepGuard, bad_batches
 from r3dpa.callbacks.bad_batches import read_bad_batch
 
 pytestmark = [

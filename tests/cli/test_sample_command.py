@@ -174,8 +174,8 @@ class TestSample:
 
     def test_the_guidance_of_the_weights_is_recorded_and_can_be_turned_off(self, tmp_path):
         geometry = ScanGeometry(SphericalProjection(SENSOR), RangeCodec(), (2, 8))
-        settings = {"guidance_block": 1, "guidance_scale": 1.5}
-        path = tiny_checkpoint(tmp_path / "guided.safetensors", geometry, sit_args=settings)
+        recorded = {"perturbed_attention": {"block": 1, "scale": 1.5}}
+        path = tiny_checkpoint(tmp_path / "guided.safetensors", geometry, sampling=recorded)
         guided = sample(path, tmp_path / "guided")
         assert (guided["guidance_scale"], guided["nfe"]) == (1.5, 6)
         plain = sample(path, tmp_path / "plain", "--guidance_scale", 1)
@@ -187,7 +187,7 @@ class TestSample:
         (tmp_path / "range_m.npy").write_bytes(b"scenes")
         with pytest.raises(ValueError, match=r"--guidance_interval needs --autoguidance"):
             sample(tiny_file, tmp_path, "--guidance_interval", 0, 0.5, "--overwrite", "true")
-        with pytest.raises(ValueError, match=r"guidance_scale 2 needs a network with guidance_b"):
+        with pytest.raises(ValueError, match=r"guidance_scale 2 needs a checkpoint that records"):
             sample(tiny_file, tmp_path, "--guidance_scale", 2, "--overwrite", "true")
         assert (tmp_path / "range_m.npy").read_bytes() == b"scenes"
         assert len(list(tmp_path.iterdir())) == 2

@@ -10,7 +10,7 @@ from r3dpa.checkpoints import load_into, read_checkpoint
 from r3dpa.flow import average_times
 from r3dpa.modules import FewStep, few_step
 from r3dpa.modules.stage import PathDraws
-from r3dpa.nn import VAE, SiT, ThinDecoder
+from r3dpa.nn import VAE, AverageVelocitySiT, SiT, ThinDecoder
 
 pytestmark = QUIET
 
@@ -106,7 +106,8 @@ def test_stages_start_from_the_flow_of_few_steps(stage, blocks, tmp_path):
         tiny_checkpoint(tmp_path / "few.safetensors", TinyData.geometry, **settings)
     )
     module = stage_module(stage)
-    module.sit = sit = SiT(**SIT_ARGS, average_blocks=int(stage == "few_step"))
+    sit = AverageVelocitySiT(1, **SIT_ARGS) if stage == "few_step" else SiT(**SIT_ARGS)
+    module.sit = sit
     load_into({"sit": sit}, module.previous_networks(before), stage)
     flow = before.network("ema").build()
     x, time = torch.randn(2, 4, 4, 16), torch.tensor([0.3, 0.9])

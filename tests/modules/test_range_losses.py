@@ -129,7 +129,9 @@ def test_the_shipped_weights_start_a_vae_with_intensity_and_class():
     shipped = read_checkpoint("r3dpa-s")
     plain = shipped.network("vae").build()
     further = {"intensity": True, "num_classes": NUM_CLASSES}
-    sit = SiT(**{**shipped.network("ema").arguments, "average_blocks": 0, "depth": 6})
+    arguments = shipped.network("ema").arguments
+    del arguments["average_blocks"]
+    sit = SiT(**{**arguments, "depth": 6})
     module = VAEAlignment(
         VAE(**{**shipped.network("vae").arguments, **further}),
         sit,

@@ -56,7 +56,7 @@ def read_bad_batch(path: Path) -> dict[str, Any]:
 def report_bad_batches(
     module: Any, batches: list[tuple[int, Any, dict[str, Tensor]]], norms: str, most: int
 ) -> None:
-    """Warns of the batches with a non-finite loss, or of all if none has one; saves up to ``most``."""
+    """Reports and saves the batches with a non-finite loss, or all batches if none has one."""
     folder = Path(module.trainer.default_root_dir) / "bad_batches"
     read = [(n, batch, {k: float(v) for k, v in losses.items()}) for n, batch, losses in batches]
     broken = [entry for entry in read if not all(map(math.isfinite, entry[2].values()))]

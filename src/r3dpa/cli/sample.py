@@ -58,13 +58,13 @@ def sample(
     arguments = dict(locals())
     from dataclasses import asdict
 
-    from r3dpa.baselines import scene_generator
     from r3dpa.checkpoints import read_checkpoint, read_snapshot
     from r3dpa.cli.scene_files import draw_all, generate_all, provenance, written
     from r3dpa.data.scene_writer import SceneWriter
     from r3dpa.generation import Autoguidance, SamplerConfig
     from r3dpa.io import usable_device
     from r3dpa.nn import ThinDecoder
+    from r3dpa.stages import scene_generator
 
     of_solver = ("solver", "steps", "shift", "eta", "sde_last")
     given = {name: arguments[name] for name in of_solver if arguments[name] is not None}

@@ -14,7 +14,7 @@ from torch import Tensor
 from r3dpa.flow.average_velocity import AVERAGE_STEPS, average_times, average_velocity_steps
 from r3dpa.flow.interpolant import Interpolant
 from r3dpa.flow.sde import ancestral, euler_maruyama
-from r3dpa.flow.solvers import ODE_SOLVERS, evaluations, ode_solver
+from r3dpa.flow.solvers import ODE_SOLVERS, evaluation_times, evaluations, ode_solver
 from r3dpa.flow.times import ode_times, sde_times
 
 OdeSolverName = Literal["euler", "heun", "midpoint", "ab2", "ab3", "dpmpp_2m", "unipc"]
@@ -63,6 +63,8 @@ class SamplerConfig:
                 "a sampler needs steps >= 1, shift > 0 and eta >= 0, got "
                 f"{self.steps}, {self.shift} and {self.eta}"
             )
+        if self.solver == "ddpm" and self.eta > 1:
+            raise ValueError(f"eta of ancestral steps must lie in [0, 1], got {self.eta}")
         averages = self.solver == "average_velocity"
         if averages and self.steps not in AVERAGE_STEPS:
             raise ValueError(
@@ -103,6 +105,20 @@ class SamplerConfig:
             f"{level['seconds_share']:.0%} of the time of best "
             f"(measured on: {table['measured_on']})"
         )
+
+    def times(self) -> Tensor:
+        """Times ``(nfe,)`` float64 at which the velocity is evaluated, in order.
+
+        Those of ``average_velocity`` are the starts of its steps, each of which ends at the next.
+        """
+        if self.solver == "average_velocity":
+            return average_times(self.steps)[:-1]
+        if self.solver == "euler_maruyama":
+            return sde_times(self.steps, self.sde_last_time)[:-1]
+        grid = ode_times(self.steps, shift=self.shift)
+        if self.solver in ("ddpm", "ddim"):
+            return grid[:-1]
+        return evaluation_times(self.solver, grid)
 
     def solve(
         self,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any, Literal, cast
 
 import torch
@@ -13,7 +13,7 @@ from torch import Tensor
 from r3dpa import losses
 from r3dpa.checkpoints import Checkpoint, load_into, read_checkpoint, transfer_rgb
 from r3dpa.data.datasets import LidarBatch
-from r3dpa.flow import Interpolant
+from r3dpa.flow import Interpolant, PerturbedAttention
 from r3dpa.flow.sampler import SamplerConfig
 from r3dpa.generation import SceneGenerator
 from r3dpa.geometry import RangeCodec, ScanGeometry
@@ -55,6 +55,7 @@ class GenerativeModule(Stage):
         keep_projector: Keep the RGB model's projection head where its shape fits.
         latent_noise: Largest share of noise in the latents that the decoder learns from, see
             :meth:`decoder_latents`, in the stages that train it; 0 for none.
+        guidance: Perturbed-attention guidance of generated scenes, recorded in checkpoints.
         seed: Key of the training draws.
         channels_last: Keep images and kernels of VAE and discriminator with their channels next to
             each other. The same numbers to rounding; files keep the usual order.
@@ -84,6 +85,7 @@ class GenerativeModule(Stage):
         rgb_weights: str | None = None,
         keep_projector: bool = False,
         latent_noise: float = 0.0,
+        guidance: PerturbedAttention | None = None,
         seed: int = 0,
         channels_last: bool = False,
         compile: bool = False,
@@ -107,6 +109,7 @@ class GenerativeModule(Stage):
         self.channels_last = channels_last
         self.compiles = compile
         self.latent_noise = latent_noise
+        self.guidance = guidance
         self.ema: EMA | None = None
         if self.trains_velocity:
             self.ema = EMA(sit, self.latent_norm, ema_decay, ema_buffers)
@@ -394,15 +397,20 @@ class GenerativeModule(Stage):
             sampler,
             self.interpolant.path,
             precision,
+            guidance=self.guidance,
         )
 
     # Checkpoints
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Writes weights in the usual order in memory, whatever this run works with."""
+        """Writes weights in the usual order in memory, and how scenes are to be sampled."""
         state = checkpoint["state_dict"]
         checkpoint["state_dict"] = {name: value.contiguous() for name, value in state.items()}
         super().on_save_checkpoint(checkpoint)
+        sampling = {}
+        if self.guidance is not None:
+            sampling["perturbed_attention"] = asdict(self.guidance)
+        checkpoint["r3dpa"]["sampling"] = sampling
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuses the checkpoint of another stage or of other range images."""

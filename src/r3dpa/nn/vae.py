@@ -18,10 +18,10 @@ from torch import Tensor, nn
 from r3dpa.nn.layers import (
     AttentionBlock,
     CircularConv2d,
+    Float32CircularConv2d,
     GroupNorm,
     ResBlock,
     Upsample,
-    WideCircularConv2d,
     at_least_float32,
     downsample,
     zeroed,
@@ -300,13 +300,13 @@ class VAE(Autoencoder):
         seen = (logit > 0).to(soft) + soft - soft.detach()
         return torch.cat([seen * (image[:, :1] + 1) - 1, 2 * seen - 1], dim=1)
 
-    def halve_decoder_(self) -> Self:
+    def decoder_to_bfloat16_(self) -> Self:
         """Casts the convolutions of the decoder, but for the outputs, to bfloat16 for sampling.
 
         Statistics of the norms and the result of :meth:`decode` stay float32.
         """
         for layer in self.decoder.modules():
-            if isinstance(layer, nn.Conv2d) and not isinstance(layer, WideCircularConv2d):
+            if isinstance(layer, nn.Conv2d) and not isinstance(layer, Float32CircularConv2d):
                 layer.bfloat16()
         return self
 
@@ -398,10 +398,10 @@ class _Decoder(nn.Module):
         )
         self.norm_out = GroupNorm(first)
         kernel = (1, 4) if by_pixel else (3, 3)
-        self.conv_out = WideCircularConv2d(first, out_channels * math.prod(stem), kernel)
+        self.conv_out = Float32CircularConv2d(first, out_channels * math.prod(stem), kernel)
         self.further_out: nn.Module | None = None
         if further:
-            self.further_out = WideCircularConv2d(first, further * math.prod(stem), (1, 1))
+            self.further_out = Float32CircularConv2d(first, further * math.prod(stem), (1, 1))
 
     def forward(self, latents: Tensor) -> Tensor:
         hidden = self.mid(self.conv_in(latents.to(self.conv_in.weight.dtype)))
