@@ -264,19 +264,19 @@ class SceneGenerator:
         """
         if self._prepared == (self.sampler, self.device):
             return
-        times = self.sampler.times()
+        times = self.sampler.times().float()
         target = None
         if self.sampler.solver == "average_velocity":
-            target = torch.cat([times[1:], times.new_zeros(1)]).to(self.device, torch.float32)
-        times = times.to(self.device, torch.float32)
-        self._strong.schedule(times, target)
+            target = torch.cat([times[1:], torch.zeros(1)]).to(self.device)
+        self._strong.schedule(times.to(self.device), target)
         self._velocity = self._strong
         guide = self._autoguidance
         if guide is not None and self._weak is not None:
             scale, shift = guide.latent_scale, guide.latent_shift
             first, last = guide.interval
             guided = times[(times >= first) & (times <= last) & (guide.scale != 1)]
-            self._weak.schedule(renormalised_times(guided, scale, shift, self.interpolant))
+            weak_times = renormalised_times(guided.to(self.device), scale, shift, self.interpolant)
+            self._weak.schedule(weak_times)
             weak = renormalised(self._weak, scale, shift, self.interpolant)
             self._velocity = autoguided(self._strong, weak, guide.scale, guide.interval)
         self._prepared = (self.sampler, self.device)
