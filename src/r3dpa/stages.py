@@ -15,6 +15,13 @@ if TYPE_CHECKING:
 BASELINE_STAGES = ("r2dm", "r2flow", "lidm")
 
 
+def published_sampler(checkpoint: Checkpoint) -> SamplerConfig:
+    """Sampler of the paper or the released script of a baseline."""
+    from r3dpa.baselines import baseline_of
+
+    return baseline_of(checkpoint).published
+
+
 def scene_generator(
     checkpoint: str | Path | Checkpoint,
     sampler: SamplerConfig | Quality | None = None,

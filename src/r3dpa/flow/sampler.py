@@ -94,6 +94,22 @@ class SamplerConfig:
         level = levels[quality]
         return cls(solver=level["solver"], steps=level["steps"], shift=level["shift"])
 
+    def changed(self, **settings: Any) -> Self:
+        """This sampler with other settings; another solver keeps the settings that it reads."""
+        solver = settings.get("solver", self.solver)
+        read = ("steps", *_READS.get(solver, ("shift",)))
+        kept = {name: getattr(self, name) for name in read}
+        return type(self)(**{"solver": solver, **kept, **settings})
+
+    @property
+    def summary(self) -> str:
+        """Solver, steps, and the settings that differ from their defaults, in one line."""
+        parts = [str(self.solver), f"{self.steps} steps"]
+        for name in ("shift", "eta", "sde_last", "sde_last_time"):
+            if getattr(self, name) != getattr(type(self), name):
+                parts.append(f"{name} {getattr(self, name)}")
+        return ", ".join(parts)
+
     @staticmethod
     def quality_line(quality: Quality) -> str:
         """One line of text about the sampler of :meth:`of_quality`."""
