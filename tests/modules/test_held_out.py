@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import socket
+from types import SimpleNamespace
 
 import lightning as L
 import pytest
@@ -134,3 +135,13 @@ def test_losses_do_not_depend_on_the_number_of_processes(
         for count in map(str, counts):
             assert len(alone[count]) == 8
             assert shared[count] == pytest.approx(alone[count], rel=1e-6, abs=1e-6), count
+
+
+def test_draws_for_held_out_scans_are_not_those_of_training():
+    """Batch 3 of one sample and held-out scan 3 have the same seed and number."""
+    module = stage_module("joint")
+    module._trainer = SimpleNamespace(world_size=1, global_rank=0)
+    held_out, training = module.draw_held_out(torch.tensor([3])), module.draw_path(1, 3)
+    for name, values in held_out._asdict().items():
+        assert values.shape == getattr(training, name).shape
+        assert not torch.equal(values, getattr(training, name)), name
