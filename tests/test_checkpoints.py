@@ -20,7 +20,7 @@ from r3dpa.checkpoints import (
     to_official,
     transfer_rgb,
 )
-from r3dpa.checkpoints.older import current_network
+from r3dpa.class_paths import current_network
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
 from r3dpa.nn.average_velocity import AverageVelocitySiT
 from r3dpa.nn.discriminator import PatchDiscriminator

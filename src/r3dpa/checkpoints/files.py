@@ -25,7 +25,8 @@ from r3dpa.checkpoints.baselines import READERS
 from r3dpa.checkpoints.lidm import from_lidm, is_lidm
 from r3dpa.checkpoints.networks import FACTS, Checkpoint, NetworkState, path_of
 from r3dpa.checkpoints.official import OURS, from_official, is_official, statistics_of, to_official
-from r3dpa.checkpoints.older import current_network, recorded_sampling
+from r3dpa.checkpoints.older import recorded_sampling
+from r3dpa.class_paths import current_network
 from r3dpa.io import (
     UNPICKLING_ERRORS,
     atomic_path,
