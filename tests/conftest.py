@@ -76,7 +76,6 @@ def smoke_args(smoke_root):
         words = [word for path in [*configs, CONF / "smoke.yaml"] for word in ("--config", path)]
         words += ["--data.init_args.root", smoke_root, "--run_dir", run_dir]
         if stage == "few_step":
-            words += ["--model.init_args.sit.class_path=r3dpa.nn.AverageVelocitySiT"]
             words += ["--model.init_args.sit.init_args.average_blocks=1"]
             words += [f"--model.init_args.thin_decoder.init_args={json.dumps(THIN_DECODER)}"]
             words += ["--model.init_args.trajectories=6"]

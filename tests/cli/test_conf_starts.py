@@ -145,7 +145,6 @@ def test_experiments_with_tiny_networks(experiment, data, start, smoke_root, tmp
         settings |= start_flow(tmp_path, smoke["vae"]["init_args"], (16, 64), sit)
     if stage == "few_step":
         settings |= {
-            "model.init_args.sit.class_path": "r3dpa.nn.AverageVelocitySiT",
             "model.init_args.sit.init_args.average_blocks": 1,
             "model.init_args.thin_decoder.init_args": json.dumps(THIN_DECODER),
         }
