@@ -538,3 +538,34 @@ class TestFewSteps:
             tmp_path / "half.safetensors", "instant", device="cpu"
         )
         assert half.generate([0]).range_m.isfinite().all()
+
+
+def test_a_generator_and_a_vae_say_what_they_are_in_one_line(checkpoint):
+    scenes = generator(SamplerConfig("ab3", 5))
+    assert repr(scenes) == (
+        "SceneGenerator(16 x 64 pixels, ab3 with 5 steps, guidance_scale 1, fp32, cpu)"
+    )
+    vae = r3dpa.SceneVAE.from_checkpoint(checkpoint, device="cpu")
+    assert repr(vae) == "SceneVAE(16 x 64 pixels, latents 4 x 4 x 16, cpu)"
+
+
+def test_networks_move_and_their_tables_follow(checkpoint):
+    weak = Autoguidance(tiny_networks()[1], 2.0, latent_scale=1.2, latent_shift=torch.zeros(4))
+    scenes = SceneGenerator(*tiny_networks(), GEOMETRY, ODE, autoguidance=weak)
+    scenes.generate([0])
+    assert scenes.to("meta") is scenes
+    assert scenes.generate([0]).range_m.device.type == "meta"
+    vae = r3dpa.SceneVAE.from_checkpoint(checkpoint, device="cpu")
+    assert vae.to("meta").device.type == "meta"
+    compiled = SceneGenerator(*tiny_networks(), GEOMETRY, ODE, batch_size=1, compile=True)
+    with pytest.raises(ValueError, match="compiled networks cannot move"):
+        compiled.to("cpu")
+
+
+def test_progress_is_shown_on_request(capsys):
+    scenes = generator(ODE)
+    quiet = scenes.generate([0])
+    assert capsys.readouterr().err == ""
+    loud = scenes.generate([0], progress=True)
+    assert "5/5" in capsys.readouterr().err  # evaluations of three Heun steps
+    assert torch.equal(quiet.latents, loud.latents)

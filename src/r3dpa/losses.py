@@ -102,10 +102,10 @@ def generator_loss(fake_logits: Tensor) -> Tensor:
 
 
 def balanced_gradient(image: Tensor, ratio: float) -> Tensor:
-    """The image, for a further loss whose gradient is ``ratio`` times that of an L1 loss.
+    """The image, for a further loss whose gradient is ``ratio`` times an L1 loss's.
 
     The gradient of each sample that flows back gets this length, whatever its own. Without, the
-    gradient of a fixed adversarial weight is hundredths of that of the reconstruction, or swamps
+    gradient of a fixed adversarial weight is hundredths of the reconstruction's, or swamps
     it, depending on the discriminator.
 
     Source: as the adaptive weight of Esser et al., "Taming transformers" (CVPR 2021), per sample

@@ -15,8 +15,7 @@ from torch import Tensor
 
 from r3dpa.io import atomic_path
 from r3dpa.modules import GenerativeModule
-
-_ENTRIES = ("stage", "step", "precision", "path", "losses", "weights", "batch", "draws")
+from r3dpa.modules.stage import PathDraws
 
 
 def save_bad_batch(
@@ -32,7 +31,6 @@ def save_bad_batch(
         "step": module.global_step,
         "precision": str(module.trainer.precision),
         "path": module.interpolant.path,
-        "names": list(batch.get("name", ())),
         "losses": losses,
         "weights": weights,
         "batch": {key: value.cpu() for key, value in tensors.items()},
@@ -48,7 +46,7 @@ def read_bad_batch(path: Path) -> dict[str, Any]:
     """Content of a file of :func:`save_bad_batch`, or a ValueError that names the file."""
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
-        return {name: content[name] for name in _ENTRIES}
+        return content | {"draws": PathDraws(**content["draws"])}
     except (pickle.UnpicklingError, RuntimeError, LookupError, TypeError, EOFError) as error:
         raise ValueError(f"{path} is no saved batch of r3dpa, or damaged: {error}") from error
 

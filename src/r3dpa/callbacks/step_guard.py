@@ -25,10 +25,6 @@ class StepGuard(L.Callback):
     Args:
         max_skipped_steps: Skipped steps in a row after which training stops.
         saved_batches: Most batches that each process saves in ``<run_dir>/bad_batches``.
-
-    Attributes:
-        stop: Signal that requests this process to stop, 0 for none; after a step the highest of all
-            processes, see :class:`r3dpa.callbacks.RunCheckpoint`.
     """
 
     def __init__(
@@ -36,7 +32,8 @@ class StepGuard(L.Callback):
     ) -> None:
         self.max_skipped_steps = max_skipped_steps
         self.saved_batches = saved_batches
-        self.skipped = self.in_a_row = self.stop = 0
+        self.skipped = self.in_a_row = 0
+        self.stop = 0  # stop signal of this process; after a step the highest of all processes
         self._batches: list[tuple[int, Any, dict[str, Tensor]]] = []  # number, content, losses
         self._buffers: list[tuple[Tensor, Tensor]] = []  # and their values before the step
 
@@ -87,10 +84,10 @@ class StepGuard(L.Callback):
             report_bad_batches(pl_module, batches, values, self.saved_batches)
         if self.in_a_row >= self.max_skipped_steps:
             raise RuntimeError(
-                f"{self.in_a_row} steps in a row had a non-finite loss or gradient, the last one "
-                f"at step {trainer.global_step} (gradient norms: {values}). Look at the named "
-                f"samples, with `r3dpa replay` in {trainer.default_root_dir}/bad_batches; if they "
-                "are sound, lower the learning rate, or leave fp16 for bf16 or fp32"
+                f"{self.in_a_row} steps in a row had a non-finite loss or gradient, the last at "
+                f"step {trainer.global_step} (gradient norms: {values}). Run `r3dpa replay` on "
+                f"{trainer.default_root_dir}/bad_batches; if the samples are sound, lower the "
+                "learning rate, or leave fp16 for bf16 or fp32"
             )
 
     def _find_faults(self, norms: Tensor) -> list[int]:

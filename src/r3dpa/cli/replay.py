@@ -20,7 +20,6 @@ def replay(file: Path, ckpt: Path, device: str = "cpu") -> str:
     from r3dpa.callbacks.bad_batches import listed, read_bad_batch
     from r3dpa.checkpoints import read_checkpoint
     from r3dpa.modules import FewStep, FlowMatching, JointAlignment, LossWeights, VAEAlignment
-    from r3dpa.modules.stage import PathDraws
 
     saved, weights = read_bad_batch(file), read_checkpoint(ckpt)
     stages = {s.stage: s for s in (VAEAlignment, JointAlignment, FlowMatching, FewStep)}
@@ -28,14 +27,14 @@ def replay(file: Path, ckpt: Path, device: str = "cpu") -> str:
     networks: Any = {name: weights.network(name).build() for name in known}
     settings = LossWeights(**saved["weights"])
     module = stages[saved["stage"]](**networks, weights=settings, path=saved["path"]).to(device)
-    draws = PathDraws(**{name: value.to(device) for name, value in saved["draws"].items()})
+    draws = saved["draws"]._make(value.to(device) for value in saved["draws"])
     batch: Any = {name: value.to(device) for name, value in saved["batch"].items()}
     # Without a trainer there is no number of the batch, and nothing to log to.
     module.draw_path = lambda *_: draws  # type: ignore[method-assign]
     module.log_dict = lambda *_: None  # type: ignore[method-assign]
 
     lines = [f"{file}: stage {saved['stage']}, step {saved['step']}, {saved['precision']}"]
-    for name, value in {**saved["batch"], **saved["draws"], **module.state_dict()}.items():
+    for name, value in (batch | draws._asdict() | module.state_dict()).items():
         if num_bad := int((~value.isfinite()).sum()):
             lines.append(f"{name}: {num_bad} of {value.numel()} values are not finite")
     broken: dict[str, bool] = {}  # layers with a bad output, and whether their inputs were finite

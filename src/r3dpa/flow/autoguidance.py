@@ -1,4 +1,4 @@
-"""Guidance away from a weaker velocity: another model's, or that of perturbed attention.
+"""Guidance away from a weaker velocity: of another model, or of perturbed attention.
 
 Letters: B batch, C latent channels, ``...`` further axes of the latents.
 """

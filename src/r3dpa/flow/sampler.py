@@ -68,8 +68,8 @@ class SamplerConfig:
         averages = self.solver == "average_velocity"
         if averages and self.steps not in AVERAGE_STEPS:
             raise ValueError(
-                f"average_velocity takes {', '.join(map(str, AVERAGE_STEPS))} steps, those that "
-                f"stage few_step trains, got {self.steps}"
+                f"average_velocity takes {', '.join(map(str, AVERAGE_STEPS))} steps, as "
+                f"stage few_step trains them, got {self.steps}"
             )
         read = _READS.get(self.solver, ("shift",))
         for name in ("shift", "eta", "sde_last", "sde_last_time"):
@@ -125,7 +125,7 @@ class SamplerConfig:
     def times(self) -> Tensor:
         """Times ``(nfe,)`` float64 at which the velocity is evaluated, in order.
 
-        Those of ``average_velocity`` are the starts of its steps, each of which ends at the next.
+        For ``average_velocity`` these are the starts of its steps, each of which ends at the next.
         """
         if self.solver == "average_velocity":
             return average_times(self.steps)[:-1]

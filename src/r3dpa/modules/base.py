@@ -254,7 +254,8 @@ class GenerativeModule(Stage):
     def _range_losses(self, image: Tensor, prediction: Tensor) -> dict[str, Tensor]:
         """Losses ``(B,)`` of images of range and return, of their intensity and class too.
 
-        All but that of returns are means over the pixels with a return, of classes with a label.
+        Means over the pixels with a return, of classes with a label; the loss of returns is one
+        over all pixels.
         """
         outputs = self.vae.outputs_of(prediction)
         ranges, returns = image[:, :1], image[:, 1:2] > 0
@@ -419,7 +420,7 @@ class GenerativeModule(Stage):
 
 
 def check_image(vae: VAE, codec: RangeCodec) -> None:
-    """Refuses a VAE of other images than those of a codec."""
+    """Refuses a VAE of other images than a codec encodes."""
     of_vae = f"channels {vae.image_channels}, intensity {vae.intensity}, "
     of_vae += f"num_classes {vae.num_classes}"
     of_codec = f"channels {codec.channels}, intensity {codec.intensity_channel}, "

@@ -229,14 +229,16 @@ class FewStep(FlowMatching):
             return {"reconstruction": zero_loss(self.thin_decoder)}
         with torch.no_grad():
             image = self.vae.decode(torch.stack(part))
-        found = self.reconstruction_losses(image, self.thin_decoder.predict(torch.stack(part)))
+        losses_of_part = self.reconstruction_losses(
+            image, self.thin_decoder.predict(torch.stack(part))
+        )
         num_decoded = math.ceil(world * len(latents) / _DECODED)  # of all processes
         weight = world * len(part) / num_decoded  # the mean over processes is one over the part
-        return {name: weight * loss for name, loss in found.items()}
+        return {name: weight * loss for name, loss in losses_of_part.items()}
 
 
 def _check_thin_decoder(thin_decoder: ThinDecoder, vae: VAE) -> None:
-    """Refuses a thin decoder of other latents or images than those of the VAE."""
+    """Refuses a thin decoder of other latents or images than the VAE has."""
     names = ("in_channels", "latent_channels", "stride", "modes", "least_scale")
     for name in (*names, "intensity", "num_classes"):
         expected, given = getattr(vae, name), getattr(thin_decoder, name)

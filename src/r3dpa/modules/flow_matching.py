@@ -30,9 +30,9 @@ class FlowMatching(GenerativeModule):
     Args:
         vae: Range-image autoencoder; its weights come from ``init_from`` and stay fixed.
         sit: Velocity network.
-        weights: Loss weights; those of the VAE are not used here.
+        weights: Loss weights; the ones of the VAE are not used here.
         cache_latents: Encode each training scan once, before the first step, and keep the posterior
-            in ``<run_dir>/latents`` (131 kB a scan at 8 x 16 x 128): a step is then the same, to
+            in ``<run_dir>/latents`` (131 kB per scan at 8 x 16 x 128): a step is then the same, to
             rounding, at a tenth of its cost. Scans may be rotated, but not mirrored.
         latents_dir: Folder of the cached posteriors, which several runs may share; default:
             ``<run_dir>/latents``.

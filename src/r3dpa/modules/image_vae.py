@@ -20,7 +20,7 @@ class ImageVAETraining(ImageStage):
 
     Args:
         vae: Image autoencoder.
-        weights: Loss weights; those of reconstruction and KL count.
+        weights: Loss weights; ``reconstruction`` and ``kl`` count.
         optimizer: Optimiser settings.
         seed: Key of the training draws.
     """

@@ -34,7 +34,7 @@ class PointPretraining(LightningModule):
     BEST-RQ (Chiu et al., 2022) for speech and MaskFeat (Wei et al., 2022) for images.
 
     Args:
-        network: Network to train; its ``cells`` are those of the scans' grid.
+        network: Network to train; its ``cells`` equal the scans' grid.
         lr: Peak learning rate; rises over ``warmup`` steps and falls to 0 as a cosine until
             ``max_steps`` of the trainer.
         weight_decay: Of AdamW, on matrices only.

@@ -24,7 +24,7 @@ class RGBPretraining(ImageStage):
     """Stage 0: unconditional SiT on image latents, by L_denoise (+ lambda L_align).
 
     The image VAE is frozen: each training image is encoded once, before the first step, and the
-    latent statistics are those of the data set.
+    latent statistics are measured on the data set.
     With a teacher the tokens are aligned with its features of the image (REPA). The checkpoint is
     what ``rgb_weights`` of the other stages takes.
 
@@ -37,7 +37,7 @@ class RGBPretraining(ImageStage):
         teacher: Frozen image network to align with; None aligns with nothing.
         init_from: Trained image VAE: checkpoint of stage ``image_vae``, or the
             ``diffusion_pytorch_model.safetensors`` of a VAE of Stable Diffusion.
-        weights: Loss weights; those of the velocity and of ``sit_alignment`` count. The latter must
+        weights: Loss weights; ``denoising`` and ``sit_alignment`` count. The latter must
             be 0 without a teacher.
         optimizer: Optimiser settings.
         time_sampling: Density of the training times.
@@ -125,7 +125,7 @@ class RGBPretraining(ImageStage):
     def _encoded(self) -> CachedTensors[ImageEntry]:
         """Posteriors of all training images; the processes share the work.
 
-        A ``fast_dev_run`` makes those of its batches alone.
+        A ``fast_dev_run`` encodes its batches alone.
         """
         trainer, datamodule = self.trainer, self.images
         entries = datamodule.train_set.entries

@@ -101,7 +101,7 @@ class Stage(L.LightningModule, ABC):
     def attach_scans(self) -> tuple[Any, ScanGeometry]:
         """Data module and scan geometry, after a check of the trainer; keeps what files record.
 
-        The data module may be any whose batches are those of :class:`r3dpa.data.LidarBatch`.
+        The data module may be any that gives :class:`r3dpa.data.LidarBatch` batches.
         """
         check_trainer(self.trainer)
         datamodule = getattr(self.trainer, "datamodule", None)
@@ -338,7 +338,7 @@ class Stage(L.LightningModule, ABC):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuses the checkpoint of another stage or of other range images, and keeps its step.
 
-        Optimiser settings stay those of this run.
+        Optimiser settings stay as this run has them.
         """
         self.loaded_step = checkpoint.get("global_step", 0)
         facts = checkpoint.get("r3dpa", {})
@@ -465,7 +465,7 @@ def check_trainer(trainer: L.Trainer) -> None:
 
 
 def check_latents(vae: VAE | ImageVAE, sit: VelocityNetwork, image_size: tuple[int, int]) -> None:
-    """Refuses a velocity network of other latents than those of the images."""
+    """Refuses a velocity network of other latents than the images have."""
     if sit.in_channels != vae.latent_channels:
         raise ValueError(
             f"sit.in_channels is {sit.in_channels}, but the VAE has {vae.latent_channels} latent "

@@ -48,8 +48,8 @@ class AverageVelocitySiT(SiT):
         """Mean ``(B, C, h, w)`` of the velocity along the path from ``time`` to ``target``.
 
         ``(x_t - x_r) / (t - r)`` of the points at ``time`` t and ``target`` r, both ``(B,)``. The
-        first blocks are those of :meth:`velocity`; the copies are also modulated by ``t - r``, by
-        weights that start at 0: until training it equals :meth:`velocity` bit for bit.
+        first blocks are shared with :meth:`velocity`; the copies are also modulated by ``t - r``,
+        by weights that start at 0: until training it equals :meth:`velocity` bit for bit.
         """
         self._check(latents, time)
         return self.average_velocity_at(latents, self.average_modulations(time, target, labels))
@@ -75,7 +75,7 @@ class AverageVelocitySiT(SiT):
         return self.output(self.average.final_layer, tokens, modulations)
 
     def with_average(self, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Weights of a :class:`SiT`, completed to those of this network by copies."""
+        """Weights of a :class:`SiT` with the copies that this network adds."""
         own = self.state_dict()
         first = len(self.blocks) - len(self.average.blocks)
         added = {key: own[key] for key in own if key.startswith("average.embedder.")}

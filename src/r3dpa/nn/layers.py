@@ -1,4 +1,4 @@
-"""Layers that several networks share; in those of range images columns wrap around.
+"""Layers that several networks share; for range images, columns wrap around.
 
 Letters: B batch, C channels, H x W image or latent size, N tokens, D token width.
 """

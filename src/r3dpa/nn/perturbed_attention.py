@@ -11,7 +11,7 @@ from r3dpa.nn.sit import SiT
 def velocity_and_perturbed(
     sit: SiT, latents: Tensor, modulations: Tensor, block: int
 ) -> tuple[Tensor, Tensor]:
-    """Velocities ``(B, C, h, w)``: that of the network, and that with identity attention.
+    """Velocity of the network, and with identity attention, both ``(B, C, h, w)``.
 
     In the second each token attends to itself alone in one block. The blocks before it are
     evaluated once, those behind it on both.

@@ -120,7 +120,7 @@ class Autoencoder(nn.Module):
         return Posterior(self.quant_conv(self.encoder(image)))
 
     def predict(self, latents: Tensor) -> Tensor:
-        """Outputs of the decoder, those that the reconstruction loss is computed of."""
+        """Outputs of the decoder, from which the reconstruction loss is computed."""
         return self.decoder(self.post_quant_conv(latents))
 
     def image_of(self, prediction: Tensor) -> Tensor:
@@ -160,14 +160,14 @@ class VAE(Autoencoder):
 
     ``intensity`` and ``num_classes`` add channels to such images: the encoder takes the class as
     one channel for each, the decoder predicts their logits. They enter and leave through layers of
-    their own, whose kernels are 1 x 1 to save time. That of the encoder starts at 0: with the other
-    weights of a VAE without these channels, this one has its latents.
+    their own, whose kernels are 1 x 1 to save time. The one of the encoder starts at 0: with the
+    other weights of a VAE without these channels, this one has its latents.
 
     Source: Ran et al., "Towards realistic scene generation with LiDAR diffusion models" (CVPR
-    2024); R3DPA (ICRA 2026) uses h2p4d8. State-dict keys are those of the official checkpoints.
+    2024); R3DPA (ICRA 2026) uses h2p4d8. State-dict keys follow the official checkpoints.
 
     Args:
-        in_channels: Channels of the range image, without those of intensity and class.
+        in_channels: Channels of the range image, without intensity and class.
         latent_channels: Channels C of the latents.
         channels: Base width, a multiple of 32.
         channel_multipliers: Width of each level in units of the base width.
@@ -286,7 +286,7 @@ class VAE(Autoencoder):
         return torch.cat([image, *further], dim=1) if further else image
 
     def scan_of(self, prediction: Tensor) -> Tensor:
-        """Images ``(B, in_channels, H, W)`` of outputs, as a discriminator sees those of scans.
+        """Images ``(B, in_channels, H, W)`` of outputs, as a discriminator sees scans.
 
         They are without intensity and class. Where the second channel is the logit of a return, it
         becomes 1 or -1, and the range -1 without one: the logit would give every reconstruction
@@ -419,7 +419,7 @@ class _Decoder(nn.Module):
 
 
 class _Level(nn.Module):
-    """Residual blocks, each followed by attention if asked for, and a resampling layer."""
+    """Residual blocks, optionally each followed by attention, and a resampling layer."""
 
     def __init__(
         self,

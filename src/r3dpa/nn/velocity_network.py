@@ -38,7 +38,7 @@ class VelocityNetwork(nn.Module, ABC):
 
     Arguments of all evaluations: ``latents`` ``(B, C, h, w)`` noisy normalised latents, ``time``
     ``(B,)`` flow times (0 data, 1 noise), ``labels`` ``(B,)`` int64 classes, which a one-class
-    model does not need. Wrong latents or times, or missing labels, are a ``ValueError``.
+    model does not need. Wrong latents or times, or missing labels, raise a ValueError.
 
     Attributes:
         input_size: Latent rows and columns ``(h, w)``.
