@@ -24,6 +24,7 @@ __all__ = [
     "reconstruction_errors",
     "reconstruction_loss",
     "return_loss",
+    "unit_vectors",
 ]
 
 
@@ -176,7 +177,7 @@ def alignment_loss(
         ``(B,)`` in [-1, 1], float32; 0 for a sample whose cells are all empty.
     """
     feature_grid = feature_grid.float()
-    cosine = (_unit(projected.float()) * _unit(feature_grid)).sum(dim=-1)
+    cosine = (unit_vectors(projected.float()) * unit_vectors(feature_grid)).sum(dim=-1)
     if not skip_empty_cells:
         return -cosine.mean(dim=1)
     occupied = feature_grid.abs().amax(dim=-1) > 0
@@ -191,7 +192,8 @@ def centred_features(feature_grid: Tensor) -> Tensor:
     return (feature_grid - mean) * occupied
 
 
-def _unit(vectors: Tensor, eps: float = 1e-6) -> Tensor:
+def unit_vectors(vectors: Tensor, eps: float = 1e-6) -> Tensor:
+    """Unit vectors along the last axis; unlike ``normalize`` the gradient is finite at zero."""
     # Beyond 2^64 the squares are infinite and the cosine would be 0.
     scale = vectors.detach().abs().amax(dim=-1, keepdim=True).clamp(min=1)
     vectors = vectors / scale

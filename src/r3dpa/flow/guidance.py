@@ -16,9 +16,7 @@ from torch import Tensor
 from r3dpa.flow.sde import DriftChange
 from r3dpa.flow.solvers import Velocity
 from r3dpa.flow.times import check_interval, per_sample
-
-_COSINE_EPS = 1e-6
-
+from r3dpa.losses import unit_vectors
 
 Finish = Callable[[], Tensor]
 AlignedVelocity = Callable[[Tensor, Tensor], tuple[Tensor, Finish]]
@@ -67,7 +65,7 @@ class FeatureTarget:
             raise ValueError("the weights of stitched features must be finite and 0 or above")
         mixed = torch.zeros_like(_at_least_float32(sources[0]))
         for source, weights in zip(sources, token_weights.to(mixed), strict=True):
-            mixed += weights[:, None] * _unit(_at_least_float32(source))
+            mixed += weights[:, None] * unit_vectors(_at_least_float32(source))
         return cls(mixed)
 
 
@@ -174,7 +172,7 @@ class FeatureGuidance:
                 selected &= target.token_mask
             if not legacy:
                 selected &= features.abs().amax(dim=-1) > 0
-            self._target, self._selected = _unit(features), selected
+            self._target, self._selected = unit_vectors(features), selected
             self._num_dropped = torch.zeros((), dtype=torch.long, device=features.device)
         self._spread = selected.double().mean(dim=1).sqrt()  # float64: see _limited
         self._idle = scale == 0 or max_ratio == 0 or not bool(selected.any())
@@ -249,7 +247,7 @@ class FeatureGuidance:
                 f"guidance towards features of shape {tuple(self._target.shape)}, but the "
                 f"network projects to {tuple(features.shape)}"
             )
-        cosine = (_unit(_at_least_float32(features)) * self._target).sum(dim=-1)
+        cosine = (unit_vectors(_at_least_float32(features)) * self._target).sum(dim=-1)
         counts = self._selected.sum() if self._legacy else self._selected.sum(dim=1)
         return -torch.where(self._selected, cosine, 0.0).sum(dim=1) / counts.clamp(min=1)
 
@@ -277,10 +275,3 @@ class FeatureGuidance:
 
 def _at_least_float32(values: Tensor) -> Tensor:
     return values.to(torch.promote_types(values.dtype, torch.float32))
-
-
-def _unit(vectors: Tensor) -> Tensor:
-    """Unit vectors along the last axis; unlike ``normalize`` the gradient is finite at zero."""
-    # Beyond 2^64 the squares are infinite and the cosine would be 0.
-    vectors = vectors / vectors.detach().abs().amax(dim=-1, keepdim=True).clamp(min=1)
-    return vectors * torch.rsqrt(vectors.square().sum(dim=-1, keepdim=True) + _COSINE_EPS**2)
