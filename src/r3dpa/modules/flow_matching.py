@@ -122,7 +122,7 @@ class FlowMatching(GenerativeModule):
         """One step on range images or posteriors, and feature grids ``(B, N, D)``."""
         latents, draws = self.draw_latents(batch)
         normalised = self.latent_norm.normalise(latents)
-        losses = self.flow_losses(self.sit, normalised, batch.get("feature_grid"), draws)
+        losses = self.flow_losses(normalised, batch.get("feature_grid"), draws)
         return self.weigh_and_log(losses)
 
     @torch.no_grad()

@@ -58,5 +58,5 @@ class JointAlignment(GenerativeModule):
             losses |= self.vae_alignment_losses(latents, features, draws)
         losses |= self.discriminator_losses(image, prediction)
         normalised = self.latent_norm.update(latents.detach())
-        losses |= self.flow_losses(self.sit, normalised, features, draws)
+        losses |= self.flow_losses(normalised, features, draws)
         return self.weigh_and_log(losses)

@@ -150,7 +150,7 @@ class RGBPretraining(ImageStage):
         posterior = Posterior(batch["posterior_moments"])
         draws = self.draw_path(len(posterior.mean))
         normalised = self.latent_norm.normalise(posterior.sample(draws.posterior_noise))
-        losses = self.flow_losses(self.sit, normalised, self._features(batch), draws)
+        losses = self.flow_losses(normalised, self._features(batch), draws)
         return self.weigh_and_log(losses)
 
     @torch.no_grad()

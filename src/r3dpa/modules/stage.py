@@ -55,7 +55,7 @@ class Stage(L.LightningModule, ABC):
     on the number of processes or on where a run was interrupted.
 
     A subclass names its ``stage``, sets ``latent_shape`` and lists its networks in
-    :meth:`trainable`. Stages with loss weights also set ``weights``.
+    :meth:`trainable`. Stages with loss weights set ``weights``, stages of a flow ``sit`` too.
 
     Args:
         optimizer: Optimiser settings.
@@ -74,6 +74,7 @@ class Stage(L.LightningModule, ABC):
     stage: str
     latent_shape: tuple[int, ...]
     weights: LossWeights
+    sit: VelocityNetwork
     interpolant: Interpolant = LINEAR
     geometry: ScanGeometry | None = None
     augmentation: Augmentation | None = None
@@ -190,11 +191,7 @@ class Stage(L.LightningModule, ABC):
         return errors
 
     def flow_losses(
-        self,
-        sit: VelocityNetwork,
-        normalised: Tensor,
-        features: Tensor | None,
-        draws: PathDraws,
+        self, normalised: Tensor, features: Tensor | None, draws: PathDraws
     ) -> dict[str, Tensor]:
         """L_denoise + lambda2 L_align on normalised latents without gradient."""
         weights = self.weights
@@ -202,16 +199,16 @@ class Stage(L.LightningModule, ABC):
         stopped = weights.alignment_stop is not None and self.global_step >= weights.alignment_stop
         aligns = weights.sit_alignment != 0 and not stopped
         errors = self.flow_errors(
-            sit, normalised, features, draws, velocity=trains_velocity, alignment=aligns
+            self.sit, normalised, features, draws, velocity=trains_velocity, alignment=aligns
         )
         if trains_velocity:
             parts = {"denoising": weights.denoising * errors["denoising"].mean()}
         else:
-            parts = {"denoising": zero_loss(sit)}
+            parts = {"denoising": zero_loss(self.sit)}
         if aligns:
             parts["sit_alignment"] = weights.sit_alignment * errors["alignment"].mean()
         elif weights.sit_alignment != 0:
-            parts["sit_alignment"] = zero_loss(sit.projector)
+            parts["sit_alignment"] = zero_loss(self.sit.projector)
         return parts
 
     def alignment_errors(self, projected: Tensor, features: Tensor | None) -> Tensor:
