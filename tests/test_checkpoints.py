@@ -20,7 +20,9 @@ from r3dpa.checkpoints import (
     to_official,
     transfer_rgb,
 )
+from r3dpa.class_paths import current_network
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
+from r3dpa.nn.average_velocity import AverageVelocitySiT
 from r3dpa.nn.discriminator import PatchDiscriminator
 from r3dpa.nn.latent_norm import LatentNorm
 from r3dpa.nn.sit import SiT
@@ -471,3 +473,24 @@ class TestTransfer:
         source = Checkpoint(Path("unet.ckpt"), "flow_matching", networks)
         with pytest.raises(ValueError, match=r"unet\.ckpt holds a UNet, but .* of a SiT"):
             transfer_rgb(source, SiT(**SIT_ARGS), LatentNorm(4), keep_projector=False)
+
+
+def test_guidance_among_the_arguments_of_a_sit_is_read_as_a_sampling_setting(tmp_path):
+    """As version 0.1.0 wrote it, with the blocks of average velocities beside it."""
+    sit = AverageVelocitySiT(1, **SIT_ARGS)
+    state = NetworkState.of(sit, {"average_blocks": 1, **SIT_ARGS})
+    content = Checkpoint(Path("few"), "few_step", {"ema": state})
+    path = save_checkpoint(content, tmp_path / "few.safetensors")
+    about = yaml.safe_load(path.with_suffix(".yaml").read_text())
+    old = {"average_blocks": 1, "guidance_block": 2, "guidance_scale": 1.5}
+    about["networks"]["ema"] = {"class_path": "r3dpa.nn.sit.SiT", "init_args": {**SIT_ARGS, **old}}
+    del about["sampling"]
+    path.with_suffix(".yaml").write_text(yaml.safe_dump(about))
+    checkpoint = read_checkpoint(path)
+    assert checkpoint.sampling == {"perturbed_attention": {"block": 2, "scale": 1.5}}
+    assert isinstance(checkpoint.network("ema").build(), AverageVelocitySiT)
+    about["networks"]["ema"]["init_args"] |= {"average_blocks": 0, "guidance_block": 0}
+    plain = current_network(about["networks"]["ema"])
+    assert plain == {"class_path": "r3dpa.nn.sit.SiT", "init_args": SIT_ARGS}
+    shipped = read_checkpoint("r3dpa-s")
+    assert shipped.sampling == {"perturbed_attention": {"block": 6, "scale": 1.5}}

@@ -24,7 +24,15 @@ from r3dpa.checkpoints import (
     read_checkpoint,
     save_checkpoint,
 )
-from r3dpa.flow import Interpolant, average_times, euler_maruyama, ode_solver, ode_times, sde_times
+from r3dpa.flow import (
+    Interpolant,
+    PerturbedAttention,
+    average_times,
+    euler_maruyama,
+    ode_solver,
+    ode_times,
+    sde_times,
+)
 from r3dpa.flow.noise import scene_random
 from r3dpa.generation import Autoguidance, SamplerConfig, SceneGenerator
 from r3dpa.geometry import (
@@ -35,7 +43,8 @@ from r3dpa.geometry import (
     points_of,
     range_image,
 )
-from r3dpa.nn import VAE, SiT
+from r3dpa.nn import VAE
+from r3dpa.nn.perturbed_attention import velocity_and_perturbed
 
 SENSOR = LidarSensor(beams=16, columns=64, range_min_m=2.0, range_max_m=40.0)
 GEOMETRY = ScanGeometry(SphericalProjection(SENSOR), RangeCodec(), (2, 8))
@@ -206,22 +215,18 @@ def test_autoguidance_is_the_written_out_formula():
     assert scenes.generate([0]).nfe == 6 + 3  # of the times 1, 5/6, ..., 1/6
 
 
-def guided_networks(**sit_args):
-    vae, sit, norm = tiny_networks()
-    guided = SiT(**SIT_ARGS, **sit_args)
-    guided.load_state_dict(guided.state_dict() | sit.state_dict())
-    return vae, guided.eval(), norm
+GUIDANCE = PerturbedAttention(block=1, scale=1.5)
 
 
 def test_scenes_are_guided_away_from_the_network_without_one_attention_map():
-    sampler, networks = SamplerConfig("ab2", 6), guided_networks(guidance_block=1)
+    sampler, networks = SamplerConfig("ab2", 6), tiny_networks()
     sit = networks[1]
-    found = SceneGenerator(*networks, GEOMETRY, sampler, guidance_scale=1.5).generate([0, 1])
+    found = SceneGenerator(*networks, GEOMETRY, sampler, guidance=GUIDANCE).generate([0, 1])
     assert found.nfe == 12
     start = torch.stack([torch.randn(LATENT_SHAPE, generator=scene_random(0, i)) for i in (0, 1)])
 
     def guided(x, time):
-        strong, weak = sit.velocity_pair_at(x, sit.modulations(time[:1]))
+        strong, weak = velocity_and_perturbed(sit, x, sit.modulations(time[:1]), 1)
         return 1.5 * strong - 0.5 * weak
 
     with torch.no_grad():
@@ -229,46 +234,61 @@ def test_scenes_are_guided_away_from_the_network_without_one_attention_map():
     torch.testing.assert_close(found.latents, expected, atol=1e-5, rtol=0)
 
 
-def test_the_scale_of_the_network_is_the_default():
-    networks = guided_networks(guidance_block=1, guidance_scale=1.5)
-    plain, guided = (
-        SceneGenerator(*networks, GEOMETRY, ODE, guidance_scale=scale).generate([0])
-        for scale in (1.0, 1.5)
-    )
-    found = SceneGenerator(*networks, GEOMETRY, ODE).generate([0])
-    assert torch.equal(found.latents, guided.latents)
-    assert torch.equal(plain.latents, generator(ODE).generate([0]).latents)
-    assert not torch.allclose(plain.latents, guided.latents, atol=1e-3)
+def test_the_recorded_guidance_is_the_default(tmp_path):
+    recorded = {"perturbed_attention": {"block": 1, "scale": 1.5}}
+    path = tiny_checkpoint(tmp_path / "guided.safetensors", GEOMETRY, sampling=recorded)
+
+    def latents(**options):
+        scenes = SceneGenerator.from_checkpoint(path, ODE, device="cpu", **options)
+        return scenes.generate([0]).latents
+
+    assert read_checkpoint(path).sampling == recorded
+    plain = generator(ODE).generate([0]).latents
+    guided = SceneGenerator(*tiny_networks(), GEOMETRY, ODE, guidance=GUIDANCE).generate([0])
+    assert torch.equal(latents(), guided.latents)
+    assert torch.equal(latents(guidance_scale=1.5), guided.latents)
+    assert torch.equal(latents(guidance_scale=1.0), plain)
+    assert not torch.allclose(plain, guided.latents, atol=1e-3)
     auto = Autoguidance(tiny_networks()[1], 1.0)  # replaces it
-    found = SceneGenerator(*networks, GEOMETRY, ODE, autoguidance=auto).generate([0])
-    assert torch.equal(found.latents, plain.latents)
+    assert torch.equal(latents(autoguidance=auto), plain)
 
 
-def test_average_velocities_are_not_guided():
-    networks = guided_networks(guidance_block=1, guidance_scale=1.5, average_blocks=1)
+def test_guidance_that_the_network_cannot_have_is_refused():
+    with pytest.raises(ValueError, match=r"block 3 of the guidance is not in 1\.\.2"):
+        SceneGenerator(*tiny_networks(), GEOMETRY, guidance=PerturbedAttention(3, 1.5))
+    with pytest.raises(ValueError, match="blocks are counted from 1, got block 0"):
+        PerturbedAttention(0, 1.5)
+
+
+def test_average_velocities_are_not_guided(few_step):
+    networks = tiny_networks(average_blocks=1)
     sampler = SamplerConfig("average_velocity", 2)
-    scenes = SceneGenerator(*networks, GEOMETRY, sampler)
+    scenes = SceneGenerator(*networks, GEOMETRY, sampler, guidance=GUIDANCE)
     assert (scenes.generate([0]).nfe, scenes.guidance_scale) == (2, 1)
     scenes = scenes.with_sampler(ODE)
     assert (scenes.generate([0]).nfe, scenes.guidance_scale) == (10, 1.5)
     with pytest.raises(ValueError, match=r"never guided: drop guidance_scale 2"):
-        SceneGenerator(*networks, GEOMETRY, sampler, guidance_scale=2.0)
+        SceneGenerator.from_checkpoint(
+            replace(few_step, sampling={"perturbed_attention": {"block": 1, "scale": 1.0}}),
+            sampler,
+            guidance_scale=2.0,
+        )
 
 
 @pytest.mark.parametrize("scale", [0.5, float("nan"), float("inf")])
 def test_a_scale_of_guidance_below_one_is_refused(scale):
     with pytest.raises(ValueError, match="scale of guidance must be a number of 1 or more"):
-        SceneGenerator(*guided_networks(guidance_block=1), GEOMETRY, ODE, guidance_scale=scale)
+        PerturbedAttention(1, scale)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scale", [1.0, 1.5], ids=["plain", "guided"])
 def test_compiled_networks_draw_the_same_scenes(scale):
     """Fused kernels round in another order; no shape is met twice, so nothing recompiles."""
-    options = {"batch_size": 3, "compile": True, "guidance_scale": scale}
-    networks = guided_networks(guidance_block=1)
-    scenes = SceneGenerator(*networks, GEOMETRY, ODE, **options)
-    plain = SceneGenerator(*networks, GEOMETRY, ODE, guidance_scale=scale).generate(range(3))
+    options = {"guidance": PerturbedAttention(1, scale)}
+    networks = tiny_networks()
+    scenes = SceneGenerator(*networks, GEOMETRY, ODE, batch_size=3, compile=True, **options)
+    plain = SceneGenerator(*networks, GEOMETRY, ODE, **options).generate(range(3))
     torch._dynamo.reset()
     torch._dynamo.utils.counters.clear()
     for part in (slice(0, 3), slice(0, 2), slice(2, 3)):
@@ -291,7 +311,7 @@ def test_options_that_do_not_fit_are_refused():
 
 @pytest.mark.parametrize("none", [0, [], -1])
 def test_a_request_for_no_scene_is_refused(none):
-    with pytest.raises(ValueError, match="no scene is asked for"):
+    with pytest.raises(ValueError, match="no scene is requested"):
         generator().generate(none)
 
 
@@ -518,3 +538,34 @@ class TestFewSteps:
             tmp_path / "half.safetensors", "instant", device="cpu"
         )
         assert half.generate([0]).range_m.isfinite().all()
+
+
+def test_a_generator_and_a_vae_say_what_they_are_in_one_line(checkpoint):
+    scenes = generator(SamplerConfig("ab3", 5))
+    assert repr(scenes) == (
+        "SceneGenerator(16 x 64 pixels, ab3 with 5 steps, guidance_scale 1, fp32, cpu)"
+    )
+    vae = r3dpa.SceneVAE.from_checkpoint(checkpoint, device="cpu")
+    assert repr(vae) == "SceneVAE(16 x 64 pixels, latents 4 x 4 x 16, cpu)"
+
+
+def test_networks_move_and_their_tables_follow(checkpoint):
+    weak = Autoguidance(tiny_networks()[1], 2.0, latent_scale=1.2, latent_shift=torch.zeros(4))
+    scenes = SceneGenerator(*tiny_networks(), GEOMETRY, ODE, autoguidance=weak)
+    scenes.generate([0])
+    assert scenes.to("meta") is scenes
+    assert scenes.generate([0]).range_m.device.type == "meta"
+    vae = r3dpa.SceneVAE.from_checkpoint(checkpoint, device="cpu")
+    assert vae.to("meta").device.type == "meta"
+    compiled = SceneGenerator(*tiny_networks(), GEOMETRY, ODE, batch_size=1, compile=True)
+    with pytest.raises(ValueError, match="compiled networks cannot move"):
+        compiled.to("cpu")
+
+
+def test_progress_is_shown_on_request(capsys):
+    scenes = generator(ODE)
+    quiet = scenes.generate([0])
+    assert capsys.readouterr().err == ""
+    loud = scenes.generate([0], progress=True)
+    assert "5/5" in capsys.readouterr().err  # evaluations of three Heun steps
+    assert torch.equal(quiet.latents, loud.latents)

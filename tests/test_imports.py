@@ -29,7 +29,8 @@ ALLOWED = {
     "checkpoints": {"geometry", "nn", "pretrained", "class_paths"},
     # A batch of scenes writes its files and shows its pages.
     "scenes": {"geometry", "data", "lidarsim", "viz"},
-    "generation": {"geometry", "nn", "flow", "checkpoints", "scenes"},
+    "scheduled_velocity": {"flow", "nn"},
+    "generation": {"geometry", "nn", "flow", "checkpoints", "scenes", "scheduled_velocity"},
     "scene_vae": {"geometry", "nn", "generation", "checkpoints", "scenes"},
     # Objects are cut out of labelled scans.
     "editing": {
@@ -46,12 +47,13 @@ ALLOWED = {
     "metrics": {"geometry", "nn", "features", "lidarsim"},  # divergences that realism has, too
     "viz": METHOD | {"metrics"},
     "baselines": METHOD,
+    "stages": {"flow", "checkpoints", "generation", "baselines"},
     "callbacks": METHOD | {"metrics", "viz", "baselines"},
     "ablation": METHOD | {"metrics", "viz", "callbacks", "baselines"},
-    "bench": METHOD | {"metrics", "viz", "callbacks", "baselines"},
+    "bench": METHOD | {"metrics", "viz", "callbacks", "baselines", "stages"},
     "__main__": {"cli"},
     "cli": METHOD
-    | {"metrics", "viz", "callbacks", "baselines", "bench", "ablation", "class_paths"},
+    | {"metrics", "viz", "callbacks", "baselines", "stages", "bench", "ablation", "class_paths"},
 }
 ANYWHERE = {"io", "__version__"}
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 
 from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint
-from r3dpa.nn import VAE, LatentNorm, SiT, ThinDecoder
+from r3dpa.nn import VAE, AverageVelocitySiT, LatentNorm, SiT, ThinDecoder
 
 VAE_ARGS = {"latent_channels": 4, "channels": 32, "num_res_blocks": 1}
 VAE_ARGS |= {"channel_multipliers": [1, 1, 1], "strides": [[2, 2], [2, 2]]}
@@ -18,7 +18,8 @@ SIT_ARGS |= {"alignment_depth": 1, "feature_dim": 8, "projector_dim": 8}
 def tiny_networks(spread=0.1, vae_args=VAE_ARGS, **sit_args):
     """``vae, sit, norm``: weights spread at random, so that scenes differ and have holes."""
     torch.manual_seed(0)
-    vae, sit, norm = VAE(**vae_args), SiT(**SIT_ARGS | sit_args), LatentNorm(4)
+    kind = AverageVelocitySiT if "average_blocks" in sit_args else SiT
+    vae, sit, norm = VAE(**vae_args), kind(**SIT_ARGS | sit_args), LatentNorm(4)
     with torch.no_grad():
         for parameter in sit.parameters():
             parameter.add_(spread * torch.randn_like(parameter))

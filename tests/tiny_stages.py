@@ -14,8 +14,7 @@ from torch.utils.data import DataLoader
 from r3dpa.callbacks import StepGuard
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
 from r3dpa.modules import FewStep, FlowMatching, JointAlignment, VAEAlignment
-from r3dpa.modules.steps import batch_number
-from r3dpa.nn import VAE, PatchDiscriminator, SiT, ThinDecoder
+from r3dpa.nn import VAE, AverageVelocitySiT, PatchDiscriminator, SiT, ThinDecoder
 
 # Only `r3dpa fit` saves plain arguments in place of networks; nothing is saved here.
 QUIET = [
@@ -127,7 +126,8 @@ ARGUMENTS = {
 
 
 def tiny_sit(**more):
-    return SiT(**ARGUMENTS["sit"] | more)
+    kind = AverageVelocitySiT if "average_blocks" in more else SiT
+    return kind(**ARGUMENTS["sit"] | more)
 
 
 def stage_module(stage, sit=tiny_sit, **kwargs):
@@ -196,7 +196,7 @@ def guarded(stage, bad=(), fault=infinite_image, numbers=None, **kwargs):
         added = 0.0
 
         def own_number(self):
-            return (numbers or range(99))[batch_number(self)]
+            return (numbers or range(99))[self.batch_number]
 
         def draw_path(self, num_scans, number=None):
             number = self.own_number() if number is None else number

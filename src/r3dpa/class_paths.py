@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 #: Old module or class, and the new one; the longest one that fits counts.
@@ -22,6 +23,10 @@ MOVED = {
 }
 
 
+_SIT = ("r3dpa.nn.SiT", "r3dpa.nn.sit.SiT")
+_AVERAGE_VELOCITY = "r3dpa.nn.average_velocity.AverageVelocitySiT"
+
+
 def current_path(path: str) -> str:
     """Import path of today for an import path of any version; other text stays as it is."""
     parts = path.split(".")
@@ -34,7 +39,26 @@ def current_path(path: str) -> str:
 def with_current_paths(value: Any) -> Any:
     """A value of a YAML file with the import paths of today."""
     if isinstance(value, dict):
-        return {key: with_current_paths(item) for key, item in value.items()}
+        return current_network({key: with_current_paths(item) for key, item in value.items()})
     if isinstance(value, list):
         return [with_current_paths(item) for item in value]
     return current_path(value) if isinstance(value, str) else value
+
+
+def current_network(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Class path and arguments of a network for the classes of this version.
+
+    Version 0.1.0 kept the guidance of generated scenes and the blocks of average velocities among
+    the arguments of SiT.
+    """
+    init_args = dict(config.get("init_args") or {})
+    recorded = {"guidance_block", "guidance_scale", "average_blocks"} & set(init_args)
+    if config.get("class_path") not in _SIT or not recorded:
+        return dict(config)
+    init_args.pop("guidance_block", None)
+    init_args.pop("guidance_scale", None)
+    average_blocks = init_args.pop("average_blocks", 0)
+    if not average_blocks:
+        return {**config, "init_args": init_args}
+    init_args["average_blocks"] = average_blocks
+    return {**config, "class_path": _AVERAGE_VELOCITY, "init_args": init_args}

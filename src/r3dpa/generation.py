@@ -3,43 +3,36 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, Self, cast
+from typing import Any, Literal, Self
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from tqdm import tqdm
 
 from r3dpa.checkpoints import Checkpoint, read_checkpoint
-from r3dpa.flow.autoguidance import autoguided, check_scale, extrapolated, renormalised
+from r3dpa.flow.autoguidance import (
+    PerturbedAttention,
+    autoguided,
+    check_scale,
+    renormalised,
+    renormalised_times,
+)
 from r3dpa.flow.interpolant import Interpolant
 from r3dpa.flow.noise import scene_noise, scene_uniform
 from r3dpa.flow.sampler import Quality, SamplerConfig
 from r3dpa.flow.solvers import Velocity
 from r3dpa.geometry import Pixels, ScanGeometry
 from r3dpa.io import usable_device
-from r3dpa.nn import VAE, LatentNorm, SiT, VelocityNetwork
+from r3dpa.nn import VAE, AverageVelocitySiT, LatentNorm, VelocityNetwork
 from r3dpa.scenes import SceneBatch
+from r3dpa.scheduled_velocity import Autoguidance, ScheduledVelocity
 
 _GRAPH_BATCH = 8  # up to this many scenes, starting kernels takes as long as running them
-
-
-@dataclass(frozen=True)
-class Autoguidance:
-    """Guidance away from a weaker model, see :func:`r3dpa.flow.autoguided`.
-
-    ``weak`` and ``latent_shift`` ``(C,)`` are on the device of the other networks; the latents of
-    the weak model are ``latent_scale * latents + latent_shift``.
-    """
-
-    weak: VelocityNetwork
-    scale: float
-    interval: tuple[float, float] = (0.0, 1.0)
-    latent_scale: float = 1.0
-    latent_shift: Tensor = field(default_factory=lambda: torch.zeros(1))
 
 
 class SceneGenerator:
@@ -57,11 +50,10 @@ class SceneGenerator:
         sampler: Solver and steps.
         path: Interpolant that the SiT was trained on.
         precision: ``bf16`` runs copies of the networks with bfloat16 weights, see
-            :meth:`VelocityNetwork.halve_` and :meth:`VAE.halve_decoder_`; state and solver stay
-            float32.
-        guidance_scale: Strength of the guidance away from the SiT without one attention map, see
-            :meth:`r3dpa.nn.SiT.velocity_pair_at`; 1 for none. Default: that of the SiT, or 1 with
-            autoguidance. Average velocities are never guided.
+            :meth:`VelocityNetwork.to_bfloat16_` and :meth:`VAE.decoder_to_bfloat16_`; state and
+            solver stay float32.
+        guidance: Block and strength of perturbed-attention guidance, for a SiT. Average velocities
+            are never guided.
         autoguidance: Weak model and strength.
         batch_size: Pad smaller batches with zeros, so that the networks see a single shape.
         compile: Compile the networks: minutes before the first scene. Needs ``batch_size``. On a
@@ -69,8 +61,8 @@ class SceneGenerator:
 
     Raises:
         ValueError: If the latent statistics were never fitted, ``batch_size`` is below 1,
-            ``compile`` comes without it, a scale is below 1, or networks, geometry, guidance and
-            sampler do not fit each other.
+            ``compile`` comes without it, or networks, geometry, guidance and sampler do not fit
+            each other.
     """
 
     def __init__(
@@ -83,7 +75,7 @@ class SceneGenerator:
         path: Literal["linear", "cosine"] = "linear",
         precision: Literal["fp32", "bf16"] = "fp32",
         *,
-        guidance_scale: float | None = None,
+        guidance: PerturbedAttention | None = None,
         autoguidance: Autoguidance | None = None,
         batch_size: int | None = None,
         compile: bool = False,
@@ -109,23 +101,22 @@ class SceneGenerator:
         self.vae, self.sit = vae.eval(), sit.eval()
         weak = None if autoguidance is None else autoguidance.weak.eval()
         if precision == "bf16":
-            self.vae = copy.deepcopy(vae).halve_decoder_()
-            self.sit = copy.deepcopy(sit).halve_()
-            weak = copy.deepcopy(weak).halve_() if weak is not None else None
-        if self.device.type == "cuda":  # its half-precision kernels expect this layout
-            self.vae = copy.deepcopy(self.vae)
-            self.vae.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+            self.vae = copy.deepcopy(vae).decoder_to_bfloat16_()
+            self.sit = copy.deepcopy(sit).to_bfloat16_()
+            weak = copy.deepcopy(weak).to_bfloat16_() if weak is not None else None
         self.latent_norm, self.geometry = latent_norm.eval(), geometry
         self.sampler, self.interpolant = sampler, Interpolant(path)
-        self.precision, self.batch_size = precision, batch_size
+        self.precision, self.batch_size, self.compiled = precision, batch_size, compile
+        self._use_channels_last_on_gpu()
         graphs = compile and self.device.type == "cuda" and (batch_size or 0) <= _GRAPH_BATCH
-        scale = _checked_scale(guidance_scale, sampler, sit, autoguidance)
-        self._strong = _ScheduledNetwork(self.sit, compile, graphs, scale)
-        self._weak = None if weak is None else _ScheduledNetwork(weak, compile, graphs)
+        if guidance is not None and guidance.scale == 1:
+            guidance = None
+        self._strong = ScheduledVelocity(self.sit, compile, graphs, guidance)
+        self._weak = None if weak is None else ScheduledVelocity(weak, compile, graphs)
         self._autoguidance = autoguidance
         self._decode = torch.compile(self.vae.decode, dynamic=False) if compile else self.vae.decode
-        self._velocity = self._guided()
-        self._scheduled: SamplerConfig | None = None
+        self._velocity: Velocity = self._strong
+        self._prepared: tuple[SamplerConfig, torch.device] | None = None
 
     @classmethod
     def from_checkpoint(
@@ -149,11 +140,12 @@ class SceneGenerator:
                 weights in this package, such as ``r3dpa-s``, or ``hf://owner/name``.
             sampler: Solver and steps, or a quality that selects them.
             weights: Averaged or last weights of the SiT.
-            decoder: That of the VAE or the thin one of stage few_step; default: thin for the
+            decoder: Decoder of the VAE, or the thin one of stage few_step; default: thin for the
                 quality ``instant`` where the checkpoint has one, full otherwise.
             device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
-            precision: As for the constructor, like all other arguments.
-            guidance_scale: See the constructor.
+            precision: See the constructor.
+            guidance_scale: Strength of perturbed-attention guidance, 1 for none. Default: as the
+                checkpoint records, or 1 with autoguidance.
             autoguidance: Weak model, on the same device.
             batch_size: See the constructor.
             compile: See the constructor.
@@ -163,7 +155,7 @@ class SceneGenerator:
             ValueError: If it cannot be read, or a network, the latent statistics or the scan
                 geometry is missing.
         """
-        checkpoint = opened(checkpoint)
+        checkpoint = open_checkpoint(checkpoint)
         if checkpoint.stage == "vae_alignment":
             raise ValueError(
                 f"{checkpoint.path} is of stage vae_alignment, which trains no velocity; sample "
@@ -184,15 +176,25 @@ class SceneGenerator:
             raise ValueError(
                 f"{checkpoint.path} holds other classes than VAE, velocity network and LatentNorm"
             )
+        if isinstance(sampler, str):
+            sampler = SamplerConfig.of_quality(sampler)
+        guidance = None
+        if guidance_scale is not None or autoguidance is None:
+            guidance = recorded_guidance(checkpoint, guidance_scale)
+        if guidance_scale not in (None, 1) and sampler.solver == "average_velocity":
+            raise ValueError(
+                f"average velocities are never guided: drop guidance_scale {guidance_scale:g}, or "
+                "take another solver or quality"
+            )
         return cls(
             vae,
             sit,
             norm,
             geometry,
-            SamplerConfig.of_quality(sampler) if isinstance(sampler, str) else sampler,
+            sampler,
             checkpoint.interpolant,
             precision,
-            guidance_scale=guidance_scale,
+            guidance=guidance,
             autoguidance=autoguidance,
             batch_size=batch_size,
             compile=compile,
@@ -207,60 +209,108 @@ class SceneGenerator:
 
     @property
     def guidance_scale(self) -> float:
-        """Strength of the guidance of the SiT away from itself; 1 for none."""
-        averages = self.sampler.solver == "average_velocity"
-        return 1.0 if averages else self._strong.guidance_scale
+        """Strength of perturbed-attention guidance; 1 for none."""
+        guidance = self._strong.guidance
+        if guidance is None or self.sampler.solver == "average_velocity":
+            return 1.0
+        return guidance.scale
 
     @property
     def latent_shape(self) -> tuple[int, int, int]:
         """Channels, rows and columns of the latents."""
         return self.sit.in_channels, *self.sit.input_size
 
+    def __repr__(self) -> str:
+        sensor, sampler = self.geometry.projection.sensor, self.sampler
+        return (
+            f"SceneGenerator({sensor.beams} x {sensor.columns} pixels, {sampler.solver} with "
+            f"{sampler.steps} steps, guidance_scale {self.guidance_scale:g}, {self.precision}, "
+            f"{self.device})"
+        )
+
+    def to(self, device: str | torch.device) -> Self:
+        """Moves the networks, and returns the generator itself."""
+        if self.compiled:
+            raise ValueError(
+                "compiled networks cannot move: build the generator on the other device"
+            )
+        device = usable_device(str(device))
+        for network in (self.vae, self.sit, self.latent_norm):
+            network.to(device)
+        if self._weak is not None and self._autoguidance is not None:
+            self._weak.sit.to(device)
+            shift = self._autoguidance.latent_shift.to(device)
+            self._autoguidance = replace(self._autoguidance, latent_shift=shift)
+        self._use_channels_last_on_gpu()
+        self._decode = self.vae.decode
+        return self
+
     def with_sampler(self, sampler: SamplerConfig) -> SceneGenerator:
         """The same networks, compiled where these are, with another solver; both may be used."""
         _check_average(sampler, self.sit, self._autoguidance)
         other = copy.copy(self)
         other._strong, other._weak = copy.copy(self._strong), copy.copy(self._weak)
-        other._velocity = other._guided()
-        other.sampler, other._scheduled = sampler, None
+        other.sampler, other._prepared = sampler, None
         return other
 
     @torch.inference_mode()
     def prepare(self) -> None:
-        """Does the set-up of the first scene; raises the errors of :meth:`SamplerConfig.solve`.
+        """Precomputes the modulations of all times of the solver, which the first scene needs.
 
-        Computes the modulations of all times of the solver: a run with velocities of 0 lists them.
+        Raises:
+            ValueError: If the times of the sampler are out of range.
         """
-        if self._scheduled == self.sampler:
+        if self._prepared == (self.sampler, self.device):
             return
-        for network in self._networks:
-            network.times, network.targets, network.table = [], [], None
-        noise = torch.zeros(1, *self.latent_shape, device=self.device)
-        self._solve(noise, iter(lambda: noise, None))
-        for network in self._networks:
-            network.fill_table()
-        self._scheduled = self.sampler
+        times = self.sampler.times().float()
+        target = None
+        if self.sampler.solver == "average_velocity":
+            target = torch.cat([times[1:], torch.zeros(1)]).to(self.device)
+        self._strong.schedule(times.to(self.device), target)
+        self._velocity = self._strong
+        guide = self._autoguidance
+        if guide is not None and self._weak is not None:
+            scale, shift = guide.latent_scale, guide.latent_shift
+            first, last = guide.interval
+            guided = times[(times >= first) & (times <= last) & (guide.scale != 1)]
+            weak_times = renormalised_times(guided.to(self.device), scale, shift, self.interpolant)
+            self._weak.schedule(weak_times)
+            weak = renormalised(self._weak, scale, shift, self.interpolant)
+            self._velocity = autoguided(self._strong, weak, guide.scale, guide.interval)
+        self._prepared = (self.sampler, self.device)
 
     @torch.inference_mode()
-    def generate(self, indices: int | Sequence[int], seed: int = 0) -> SceneBatch:
+    def generate(
+        self, indices: int | Sequence[int], seed: int = 0, *, progress: bool = False
+    ) -> SceneBatch:
         """Draws one scene per index, asynchronously on a GPU.
 
         Args:
             indices: Numbers of the scenes, or how many: 4 for ``range(4)``; at most ``batch_size``.
             seed: Number of the collection.
+            progress: Show a bar of the solver's steps.
         """
         indices = scene_indices(indices)
         size = self.batch_size or len(indices)
         if len(indices) > size:
             raise ValueError(f"batch_size is {size}, but {len(indices)} scenes are requested")
         self.prepare()
-        for network in self._networks:
-            network.calls = 0
+        networks = [self._strong] if self._weak is None else [self._strong, self._weak]
+        for network in networks:
+            network.restart()
         noise = scene_noise(self.latent_shape, indices, seed)
-        draws = (filled(x, size).to(self.device) for x in noise)
-        latents = self._solve(next(draws), draws)[: len(indices)]
-        nfe, projection = sum(one.evaluations for one in self._networks), self.geometry.projection
-        return SceneBatch.of(self.decode_pixels(latents, indices, seed), latents, nfe, projection)
+        draws = (pad_batch(x, size).to(self.device) for x in noise)
+        with tqdm(total=self._strong.num_times, desc="sampling", disable=not progress) as bar:
+
+            def velocity(*inputs: Tensor) -> Tensor:
+                bar.update()
+                return self._velocity(*inputs)
+
+            latents = self.sampler.solve(velocity, next(draws), draws, self.interpolant)
+        latents = latents[: len(indices)]
+        pixels = self.decode_pixels(latents, indices, seed)
+        nfe = sum(network.evaluations for network in networks)
+        return SceneBatch.of(pixels, latents, nfe, self.geometry.projection)
 
     @torch.no_grad()
     def decode(
@@ -285,7 +335,7 @@ class SceneGenerator:
         sensor, codec, parts = self.geometry.projection.sensor, self.geometry.codec, []
         for first in range(0, len(latents), size):
             part = self.latent_norm.denormalise(latents[first : first + size])
-            image = self._decode(filled(part, size))[: len(part)].float()
+            image = self._decode(pad_batch(part, size))[: len(part)].float()
             finite = image.flatten(1).isfinite().all(dim=1)
             if indices is not None and codec.return_channel:
                 uniform = scene_uniform(image.shape[2:], indices[first : first + size], seed)
@@ -294,7 +344,7 @@ class SceneGenerator:
             range_m = torch.where(finite[:, None, None], pixels.range_m, torch.nan)
             parts.append(pixels._replace(range_m=range_m))
         joined: list[Any] = [
-            None if own[0] is None else torch.cat(own) for own in zip(*parts, strict=True)
+            None if values[0] is None else torch.cat(values) for values in zip(*parts, strict=True)
         ]
         return Pixels(*joined)
 
@@ -306,30 +356,24 @@ class SceneGenerator:
         """First noise ``(B, C, h, w)`` of scenes, on the device of the networks."""
         return next(scene_noise(self.latent_shape, indices, seed)).to(self.device)
 
-    @property
-    def _networks(self) -> list[_ScheduledNetwork]:
-        return [self._strong, *([] if self._weak is None else [self._weak])]
-
-    def _solve(self, noise: Tensor, draws: Iterator[Tensor]) -> Tensor:
-        return self.sampler.solve(self._velocity, noise, draws, self.interpolant)
-
-    def _guided(self) -> Velocity:
-        """Velocity of the solver; made once, since ``renormalised`` reads the shift."""
-        guidance = self._autoguidance
-        if guidance is None or self._weak is None:
-            return self._strong
-        scale, shift = guidance.latent_scale, guidance.latent_shift
-        weak = renormalised(self._weak, scale, shift, self.interpolant)
-        return autoguided(self._strong, weak, guidance.scale, guidance.interval)
+    def _use_channels_last_on_gpu(self) -> None:
+        """Gives a copy of the decoder the layout that half-precision kernels of a GPU expect."""
+        if self.device.type == "cuda":
+            self.vae = copy.deepcopy(self.vae)
+            self.vae.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
 
-def opened(checkpoint: str | Path | Checkpoint) -> Checkpoint:
+def open_checkpoint(checkpoint: str | Path | Checkpoint) -> Checkpoint:
     """Content of a checkpoint that may be given as its file or name."""
     return checkpoint if isinstance(checkpoint, Checkpoint) else read_checkpoint(checkpoint)
 
 
 def geometry_of(checkpoint: Checkpoint) -> ScanGeometry:
-    """Projection and range encoding of a checkpoint; ``ValueError`` if it records none."""
+    """Projection and range encoding of a checkpoint.
+
+    Raises:
+        ValueError: If it records none.
+    """
     if checkpoint.geometry is None:
         raise ValueError(
             f"{checkpoint.path} does not record which sensor it was trained for; convert it from "
@@ -344,11 +388,32 @@ def check_precision(precision: str) -> None:
         raise ValueError(f"unknown precision {precision!r}; choose from fp32, bf16")
 
 
+def recorded_guidance(
+    checkpoint: Checkpoint, scale: float | None = None
+) -> PerturbedAttention | None:
+    """Perturbed-attention guidance that a checkpoint records, at its strength or at another.
+
+    Raises:
+        ValueError: If a strength above 1 is given, but the checkpoint names no block.
+    """
+    recorded = checkpoint.sampling.get("perturbed_attention")
+    if recorded is None:
+        if scale is not None and scale != 1:
+            check_scale(scale)
+            raise ValueError(
+                f"guidance_scale {scale:g} needs a checkpoint that records perturbed_attention, "
+                "such as r3dpa-s, or a weaker model (autoguidance)"
+            )
+        return None
+    return PerturbedAttention(recorded["block"], recorded["scale"] if scale is None else scale)
+
+
 def _check_average(
     sampler: SamplerConfig, sit: VelocityNetwork, autoguidance: Autoguidance | None
 ) -> None:
-    average = getattr(sit, "average", None)
-    if sampler.solver == "average_velocity" and (average is None or autoguidance is not None):
+    if sampler.solver != "average_velocity":
+        return
+    if not isinstance(sit, AverageVelocitySiT) or autoguidance is not None:
         raise ValueError(
             "solver average_velocity needs a network that predicts average velocities, from a "
             "checkpoint of stage few_step, and no autoguidance: drop autoguidance, or take another "
@@ -356,100 +421,18 @@ def _check_average(
         )
 
 
-def _checked_scale(
-    given: float | None,
-    sampler: SamplerConfig,
-    sit: VelocityNetwork,
-    autoguidance: Autoguidance | None,
-) -> float:
-    usual = 1.0 if autoguidance else sit.guidance_scale
-    scale = usual if given is None else given
-    check_scale(scale)
-    if scale != 1 and not sit.guidance_block:
-        raise ValueError(
-            f"guidance_scale {scale:g} needs a network with guidance_block, such as that of "
-            "r3dpa-s, or a weaker model (autoguidance)"
-        )
-    if given not in (None, 1) and sampler.solver == "average_velocity":
-        raise ValueError(
-            f"average velocities are never guided: drop guidance_scale {scale:g}, or take another "
-            "solver or quality"
-        )
-    return scale
-
-
-class _ScheduledNetwork:
-    """A network as the velocity function of a solver.
-
-    All samples of a call have the same time. A trial run records the times; afterwards the k-th
-    call takes row k of their modulations, so that no value of a time is read back from a GPU.
-
-    Attributes:
-        times: Those of the trial run, each ``(1,)``.
-        targets: Target times of average velocities, likewise.
-        table: ``(T, M)`` their modulations, after the trial run.
-        calls: Velocities since it was set to 0.
-    """
-
-    def __init__(
-        self, sit: VelocityNetwork, compile: bool, graphs: bool, guidance_scale: float = 1.0
-    ) -> None:
-        self.sit, self.guidance_scale = sit, guidance_scale
-        self.times: list[Tensor] = []
-        self.targets: list[Tensor] = []
-        self.table: Tensor | None = None
-        self.calls = 0
-        self._graphs = graphs
-        mode = "reduce-overhead" if graphs else None
-        parts = self._networks if compile else []
-        self._compiled = [torch.compile(part, dynamic=False, mode=mode) for part in parts]
-
-    @property
-    def _networks(self) -> list[Callable[[Tensor, Tensor], Tensor]]:
-        average = [self.sit.average_velocity_at] if isinstance(self.sit, SiT) else []
-        return [self.sit.velocity_at if self.guidance_scale == 1 else self._guided, *average]
-
-    @property
-    def evaluations(self) -> int:
-        """Network evaluations since ``calls`` was set to 0, two of each guided velocity."""
-        guided = self.guidance_scale != 1 and not self.targets
-        return self.calls * (2 if guided else 1)
-
-    def _guided(self, latents: Tensor, modulations: Tensor) -> Tensor:
-        pair = cast(SiT, self.sit).velocity_pair_at(latents, modulations)
-        return extrapolated(*pair, self.guidance_scale)
-
-    def fill_table(self) -> None:
-        """Ends the trial run."""
-        if self.targets:
-            sit = cast(SiT, self.sit)
-            self.table = sit.modulations(torch.cat(self.times), target=torch.cat(self.targets))
-        elif self.times:  # a weak model may be unused
-            self.table = self.sit.modulations(torch.cat(self.times))
-
-    def __call__(self, latents: Tensor, time: Tensor, target: Tensor | None = None) -> Tensor:
-        """Velocity ``(B, C, h, w)`` float32 at a time ``(B,)`` that all samples share.
-
-        With a target time, the average velocity until then.
-        """
-        if self.table is None:
-            self.times.append(time[:1])
-            self.targets += [] if target is None else [target[:1]]
-            return torch.zeros_like(latents)
-        row = self.table[self.calls : self.calls + 1]
-        self.calls += 1
-        velocity = (self._compiled or self._networks)[target is not None](latents, row)
-        return velocity.clone() if self._graphs else velocity  # a replay writes to one place
-
-
-def filled(values: Tensor, size: int) -> Tensor:
+def pad_batch(values: Tensor, size: int) -> Tensor:
     """``(B, C, h, w)`` with zeros up to ``size`` samples."""
     return F.pad(values, (0, 0, 0, 0, 0, 0, 0, size - len(values)))
 
 
 def scene_indices(indices: int | Sequence[int]) -> Sequence[int]:
-    """Numbers of scenes; a number stands for that many from 0 on. ``ValueError`` for none."""
+    """Numbers of scenes; a number stands for that many from 0 on.
+
+    Raises:
+        ValueError: If there is none.
+    """
     numbers = range(int(indices)) if isinstance(indices, int | np.integer) else indices
     if len(numbers) == 0:
-        raise ValueError("no scene is asked for: give a number of at least 1, or their indices")
+        raise ValueError("no scene is requested: give a number of at least 1, or indices")
     return numbers

@@ -21,8 +21,10 @@ __all__ = [
     "generator_loss",
     "masked_mean",
     "pixel_error",
+    "reconstruction_errors",
     "reconstruction_loss",
     "return_loss",
+    "unit_vectors",
 ]
 
 
@@ -50,6 +52,14 @@ def reconstruction_loss(
     if kind == "l2":
         return F.mse_loss(reconstruction.float(), image.float())
     raise ValueError(f"reconstruction loss must be 'l1' or 'l2', got {kind!r}")
+
+
+def reconstruction_errors(
+    reconstruction: Tensor, image: Tensor, kind: Literal["l1", "l2"] = "l1"
+) -> Tensor:
+    """:func:`reconstruction_loss` ``(B,)`` of each image."""
+    pairs = zip(reconstruction.split(1), image.split(1), strict=True)
+    return torch.stack([reconstruction_loss(*pair, kind) for pair in pairs])
 
 
 def pixel_error(prediction: Tensor, image: Tensor, kind: Literal["l1", "l2"] = "l1") -> Tensor:
@@ -93,10 +103,10 @@ def generator_loss(fake_logits: Tensor) -> Tensor:
 
 
 def balanced_gradient(image: Tensor, ratio: float) -> Tensor:
-    """The image, for a further loss whose gradient is ``ratio`` times that of an L1 loss.
+    """The image, for a further loss whose gradient is ``ratio`` times an L1 loss's.
 
     The gradient of each sample that flows back gets this length, whatever its own. Without, the
-    gradient of a fixed adversarial weight is hundredths of that of the reconstruction, or swamps
+    gradient of a fixed adversarial weight is hundredths of the reconstruction's, or swamps
     it, depending on the discriminator.
 
     Source: as the adaptive weight of Esser et al., "Taming transformers" (CVPR 2021), per sample

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from r3dpa.checkpoints import Checkpoint
-from r3dpa.generation import geometry_of, opened
+from r3dpa.generation import geometry_of, open_checkpoint
 from r3dpa.geometry import ScanGeometry, project_pixels
 from r3dpa.io import usable_device
 from r3dpa.nn import VAE
@@ -31,7 +31,26 @@ class SceneVAE:
     """
 
     def __init__(self, vae: VAE, geometry: ScanGeometry) -> None:
-        self.vae, self.geometry = vae.eval(), geometry
+        self.vae = vae.eval()
+        self.geometry = geometry
+
+    def __repr__(self) -> str:
+        sensor = self.geometry.projection.sensor
+        rows, columns = self.vae.latent_size((sensor.beams, sensor.columns))
+        return (
+            f"SceneVAE({sensor.beams} x {sensor.columns} pixels, latents "
+            f"{self.vae.latent_channels} x {rows} x {columns}, {self.device})"
+        )
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the VAE."""
+        return next(self.vae.parameters()).device
+
+    def to(self, device: str | torch.device) -> Self:
+        """Moves the VAE, and returns the object itself."""
+        self.vae.to(usable_device(str(device)))
+        return self
 
     @classmethod
     def from_checkpoint(cls, checkpoint: str | Path | Checkpoint, device: str = "auto") -> Self:
@@ -41,7 +60,7 @@ class SceneVAE:
             FileNotFoundError: If there is no such file.
             ValueError: If it cannot be read, or holds no range-image VAE or no scan geometry.
         """
-        checkpoint = opened(checkpoint)
+        checkpoint = open_checkpoint(checkpoint)
         vae = checkpoint.network("vae").build().to(usable_device(device))
         if not isinstance(vae, VAE):
             kind = type(vae).__name__
@@ -64,7 +83,7 @@ class SceneVAE:
         given = torch.as_tensor(points).float()
         known = None if labels is None else torch.from_numpy(np.asarray(labels, dtype=np.int64))
         pixels = project_pixels(given, self.geometry.projection, known)
-        image = self.geometry.codec.to_image(*pixels).to(next(self.vae.parameters()).device)
+        image = self.geometry.codec.to_image(*pixels).to(self.device)
         return self.vae.encode(image[None]).mean
 
     @torch.no_grad()

@@ -24,7 +24,9 @@ PATHS = [
 
 @pytest.mark.parametrize("path", PATHS, ids=lambda path: f"{path.schedule}{path.shift:.1f}")
 def test_coefficients_and_their_derivatives(path):
-    time = torch.linspace(0.02, 0.98, 25, dtype=torch.float64, requires_grad=True)
+    """Near the data too, down to where the rate of the linear schedule is held."""
+    time = torch.tensor([2e-4, 5e-4, 5e-3, *torch.linspace(0.02, 0.98, 25).tolist()]).double()
+    time.requires_grad_()
     alpha, sigma, d_alpha, d_sigma = path.coefficients(time)
     torch.testing.assert_close(alpha.square() + sigma.square(), torch.ones_like(time))
     for value, derivative in ((alpha, d_alpha), (sigma, d_sigma)):

@@ -35,7 +35,7 @@ def bench_decode(benchmark, layout, precision, alone):
     latents = torch.randn(1, vae.latent_channels, *vae.latent_size((64, 1024)))
     benchmark.extra_info["GFLOP"] = round(flop_of(lambda: vae.decode(latents)) / 1e9, 1)
     if precision == "bf16":
-        vae.halve_decoder_()
+        vae.decoder_to_bfloat16_()
     benchmark(vae.decode, latents)
 
 

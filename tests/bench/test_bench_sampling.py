@@ -37,8 +37,8 @@ MIXTURE = GaussianMixture(torch.eye(3, dtype=torch.float64), 0.5, torch.ones(3))
 @pytest.fixture(scope="module")
 def ckpt(tmp_path_factory):
     path = tmp_path_factory.mktemp("ckpt") / "tiny.safetensors"
-    guided = {"guidance_block": 1, "guidance_scale": 1.5}  # which is not measured
-    return tiny_checkpoint(path, GEOMETRY, stage="few_step", step=7, sit_args=guided)
+    guided = {"perturbed_attention": {"block": 1, "scale": 1.5}}  # which is not measured
+    return tiny_checkpoint(path, GEOMETRY, stage="few_step", step=7, sampling=guided)
 
 
 @pytest.fixture(scope="module")

@@ -24,6 +24,7 @@ def small_conf(tmp_path_factory):
     """The shipped experiments with the networks of conf/smoke.yaml."""
     conf = tmp_path_factory.mktemp("conf")
     smoke = yaml.safe_load((CONF / "smoke.yaml").read_text())["model"]["init_args"]
+    smoke["sit"]["class_path"] = "r3dpa.nn.SiT"
     (conf / "experiment").mkdir()
     (conf / "demo").mkdir()
     for stage in STAGES:

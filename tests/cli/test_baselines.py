@@ -10,11 +10,12 @@ import torch
 
 from lidarsim import simulate
 from lidarsim.scan_files import read_scan
-from r3dpa.baselines import BASELINES, baseline_of, scene_generator
+from r3dpa.baselines import BASELINES, baseline_of
 from r3dpa.baselines.lidm_networks import VQAutoencoder
 from r3dpa.checkpoints import Checkpoint, NetworkState, read_checkpoint, save_checkpoint
 from r3dpa.cli import main
 from r3dpa.flow.sampler import SamplerConfig
+from r3dpa.stages import scene_generator
 
 #: Settings that make a stage tiny, on 16 x 64 images.
 TINY = {

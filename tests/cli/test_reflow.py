@@ -12,13 +12,14 @@ import torch
 from test_baselines import fit_words
 
 from lidarsim import simulate
-from r3dpa.baselines import ReflowPairs, scene_generator
+from r3dpa.baselines import ReflowPairs
 from r3dpa.baselines.reflow import as_scanned
 from r3dpa.checkpoints import read_checkpoint
 from r3dpa.cli import main
 from r3dpa.flow.sampler import SamplerConfig
 from r3dpa.flow.solvers import euler
 from r3dpa.flow.times import ode_times
+from r3dpa.stages import scene_generator
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 SAMPLER = SamplerConfig("euler", 3)

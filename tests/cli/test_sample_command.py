@@ -117,7 +117,7 @@ class TestSample:
         assert {key: metadata[key] for key in expected} == expected
         numbers = ("num", "seed", "nfe", "batch_size", "drawn_by_last_run")
         assert [metadata[key] for key in numbers] == [3, 0, 3, 8, 3]
-        assert metadata["sampler"] == asdict(SamplerConfig(steps=3))
+        assert metadata["sampler"] == asdict(SamplerConfig.of_quality("good").changed(steps=3))
         assert metadata["geometry"]["projection"]["sensor"]["beams"] == SENSOR.beams
         assert metadata["seconds_per_scene"] > 0
         assert metadata["threads"] == torch.get_num_threads()
@@ -163,8 +163,28 @@ class TestSample:
         assert chosen == asdict(SamplerConfig.of_quality("draft"))
         line = f"quality draft: {chosen['solver']}, {chosen['steps']} steps, shift"
         assert line in capsys.readouterr().out
-        with pytest.raises(ValueError, match=r"--quality draft chooses what --steps gives"):
-            sample(tiny_file, tmp_path / "out", *words)
+
+    @pytest.mark.parametrize(
+        ("words", "expected", "line"),
+        [
+            (["--steps", 4], SamplerConfig("ab3", 4, shift=2.5), "ab3, 4 steps, shift 2.5"),
+            (["--shift", 1.5], SamplerConfig("ab3", 16, shift=1.5), "ab3, 16 steps, shift 1.5"),
+            (["--solver", "ab2"], SamplerConfig("ab2", 16, shift=2.5), "ab2, 16 steps, shift 2.5"),
+            (["--solver", "euler_maruyama"], SamplerConfig(steps=16), "euler_maruyama, 16 steps"),
+            (
+                ["--quality", "draft", "--steps", 3],
+                SamplerConfig("ab3", 3, shift=2.5),
+                "ab3, 3 steps, shift 2.5",
+            ),
+        ],
+    )
+    def test_single_settings_keep_the_rest_of_the_quality_and_what_runs_is_printed(
+        self, words, expected, line, tiny_file, tmp_path, capsys
+    ):
+        """The measured levels are those of quality.json."""
+        found = sample(tiny_file, tmp_path / "out", "--num", 1, *words, steps=())
+        assert found["sampler"] == asdict(expected)
+        assert f"sampler: {line}\n" in capsys.readouterr().out
 
     def test_guidance_by_the_model_itself_changes_nothing(
         self, tiny_file, scenes, tmp_path, monkeypatch
@@ -183,8 +203,8 @@ class TestSample:
 
     def test_the_guidance_of_the_weights_is_recorded_and_can_be_turned_off(self, tmp_path):
         geometry = ScanGeometry(SphericalProjection(SENSOR), RangeCodec(), (2, 8))
-        settings = {"guidance_block": 1, "guidance_scale": 1.5}
-        path = tiny_checkpoint(tmp_path / "guided.safetensors", geometry, sit_args=settings)
+        recorded = {"perturbed_attention": {"block": 1, "scale": 1.5}}
+        path = tiny_checkpoint(tmp_path / "guided.safetensors", geometry, sampling=recorded)
         guided = sample(path, tmp_path / "guided")
         assert (guided["guidance_scale"], guided["nfe"]) == (1.5, 6)
         plain = sample(path, tmp_path / "plain", "--guidance_scale", 1)
@@ -196,7 +216,7 @@ class TestSample:
         (tmp_path / "range_m.npy").write_bytes(b"scenes")
         with pytest.raises(ValueError, match=r"--guidance_interval needs --autoguidance"):
             sample(tiny_file, tmp_path, "--guidance_interval", 0, 0.5, "--overwrite", "true")
-        with pytest.raises(ValueError, match=r"guidance_scale 2 needs a network with guidance_b"):
+        with pytest.raises(ValueError, match=r"guidance_scale 2 needs a checkpoint that records"):
             sample(tiny_file, tmp_path, "--guidance_scale", 2, "--overwrite", "true")
         assert (tmp_path / "range_m.npy").read_bytes() == b"scenes"
         assert len(list(tmp_path.iterdir())) == 2

@@ -7,7 +7,6 @@ from velocities import still
 from r3dpa.editing.latents import (
     invert,
     noise_inside_mask,
-    pnp_flow_feature,
     restore_outside_mask,
     slerp,
 )
@@ -153,25 +152,3 @@ class TestSphericalMean:
             slerp(latents(), latents(), 1.5)
         with pytest.raises(ValueError, match="one shape"):
             slerp(latents(), latents()[:1], 0.5)
-
-
-def test_steps_by_hand():
-    times, noise = torch.tensor([1.0, 0.25, 0.0]).double(), silence(3)
-    noise[1] = 8.0
-
-    def feature(x, time):
-        return torch.ones_like(x)
-
-    edited = pnp_flow_feature(still, feature, latents(), edit_mask(), times, noise, exponent=0.5)
-    # t = 1: everything becomes noise, 0. t = 0.25, step 0.5: minus half a feature term, then half
-    # way to the latents where they are kept, then 3/4 of it plus a quarter of the noise.
-    anew = 0.75 * -0.5 + 2
-    kept = 0.75 * (-0.5 + 0.5 * (latents() + 0.5)) + 2
-    torch.testing.assert_close(edited, torch.where(edit_mask(), anew, kept))
-
-
-def test_edit_that_cannot_run_is_refused():
-    with pytest.raises(ValueError, match=r"\(2, 1, 4, 6\); got torch.float32"):
-        pnp_flow_feature(still, still, latents(), edit_mask().float(), ode_times(2), silence(3))
-    with pytest.raises(ValueError, match="3 times, 2 draws"):
-        pnp_flow_feature(still, still, latents(), edit_mask(), ode_times(2), silence(2))

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
+from typing import get_args
 from unittest.mock import Mock
 
 import pytest
@@ -9,6 +10,7 @@ import torch
 from velocities import gaussian_velocity, growth, standard_noise, still
 
 from r3dpa.flow.interpolant import Interpolant
+from r3dpa.flow.sampler import SamplerConfig, Solver
 from r3dpa.flow.solvers import (
     ODE_SOLVERS,
     ab2,
@@ -268,3 +270,19 @@ def test_samples_do_not_depend_on_their_batch(solver):
     for index in range(len(x)):
         alone = ODE_SOLVERS[solver](velocity, x[index : index + 1], UNEVEN)
         assert torch.equal(alone[0], together[index])
+
+
+@pytest.mark.parametrize("path", ["linear", "cosine"])
+@pytest.mark.parametrize("solver", get_args(Solver))
+def test_the_listed_times_are_those_of_the_evaluations(solver, path):
+    sampler, seen = SamplerConfig(solver, 4), []
+
+    def velocity(x, time, target=None):
+        seen.append(time[0].item())
+        return torch.zeros_like(x)
+
+    noise = torch.zeros(1, 2, dtype=torch.float64)
+    generator = torch.Generator().manual_seed(0)
+    sampler.solve(velocity, noise, generator, Interpolant(path))
+    assert sampler.times().tolist() == seen
+    assert len(seen) == sampler.nfe

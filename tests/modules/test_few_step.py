@@ -1,5 +1,6 @@
 from collections import Counter
 from itertools import pairwise
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -9,8 +10,8 @@ from tiny_stages import ARGUMENTS, QUIET, Observed, TinyData, stage_module, tiny
 from r3dpa.checkpoints import load_into, read_checkpoint
 from r3dpa.flow import average_times
 from r3dpa.modules import FewStep, few_step
-from r3dpa.modules.steps import PathDraws
-from r3dpa.nn import VAE, SiT, ThinDecoder
+from r3dpa.modules.stage import PathDraws
+from r3dpa.nn import VAE, AverageVelocitySiT, SiT, ThinDecoder
 
 pytestmark = QUIET
 
@@ -106,7 +107,8 @@ def test_stages_start_from_the_flow_of_few_steps(stage, blocks, tmp_path):
         tiny_checkpoint(tmp_path / "few.safetensors", TinyData.geometry, **settings)
     )
     module = stage_module(stage)
-    module.sit = sit = SiT(**SIT_ARGS, average_blocks=int(stage == "few_step"))
+    sit = AverageVelocitySiT(1, **SIT_ARGS) if stage == "few_step" else SiT(**SIT_ARGS)
+    module.sit = sit
     load_into({"sit": sit}, module.previous_networks(before), stage)
     flow = before.network("ema").build()
     x, time = torch.randn(2, 4, 4, 16), torch.tensor([0.3, 0.9])
@@ -115,3 +117,44 @@ def test_stages_start_from_the_flow_of_few_steps(stage, blocks, tmp_path):
     assert not torch.allclose(flow.average_velocity(x, time, 0 * time), velocity)
     if stage == "few_step":
         assert torch.equal(sit.average_velocity(x, time, 0 * time), velocity)
+
+
+def test_processes_take_all_trajectories_in_turn():
+    """Two processes with two samples each: four batches take each of 16 trajectories once."""
+    module, taken = stage_module("few_step", trajectories=16), Counter()
+    module.solve = lambda indices: taken.update(indices) or torch.zeros(len(indices), 9, 4, 4, 8)
+    for rank in (0, 1):
+        module._trainer = SimpleNamespace(world_size=2, global_rank=rank)
+        for number in range(4):
+            module.draw_path(2, number)
+    assert taken == Counter(range(16))
+
+
+def test_cached_trajectories_are_those_of_flow_seed_and_precision(monkeypatch, tmp_path):
+    def settings_of(seed=0, precision="32-true", change=None):
+        module, seen = stage_module("few_step", seed=seed), []
+        if change is not None:
+            with torch.no_grad():
+                module.get_parameter(change).add_(1.0)
+        monkeypatch.setattr(
+            few_step,
+            "tensor_cache",
+            lambda root, kind, settings, *_: seen.append(settings) or SimpleNamespace(folder=root),
+        )
+        monkeypatch.setattr(few_step, "filled", lambda *_: None)
+        module._trainer = SimpleNamespace(
+            precision=precision,
+            fast_dev_run=False,
+            default_root_dir=tmp_path,
+            datamodule=SimpleNamespace(batch_size=2),
+        )
+        FewStep.on_fit_start(module)
+        return seen[0]
+
+    usual = settings_of()
+    assert settings_of() == usual
+    assert settings_of(seed=1) != usual
+    assert settings_of(precision="bf16-mixed") != usual
+    assert settings_of(change="sit.final_layer.linear.bias") != usual
+    # The copied blocks are trained on the trajectories, and do not change them.
+    assert settings_of(change="sit.average.final_layer.linear.bias") == usual

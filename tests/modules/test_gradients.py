@@ -10,7 +10,7 @@ from torch import nn
 
 from r3dpa.callbacks import StepGuard
 from r3dpa.modules import LossWeights
-from r3dpa.modules.steps import frozen
+from r3dpa.modules.stage import frozen
 
 pytestmark = QUIET
 CLIP_BY_VALUE = {"gradient_clip_val": 1.0, "gradient_clip_algorithm": "value"}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import socket
+from types import SimpleNamespace
 
 import lightning as L
 import pytest
@@ -14,7 +15,6 @@ from tiny_stages import QUIET, SILENT, TinyData, stage_module
 from torch.utils.data import DataLoader
 
 from r3dpa.data.loader_module import LoaderModule
-from r3dpa.modules import steps
 
 pytestmark = [
     *QUIET,
@@ -64,7 +64,7 @@ def test_the_average_is_evaluated_where_there_is_one(tmp_path):
         for weight in module.ema.parameters():
             weight.mul_(1.5)
     logged = validated(module, data, tmp_path)
-    draws = steps.draw_held_out(module, torch.arange(4))
+    draws = module.draw_held_out(torch.arange(4))
     losses = {}
     for name, networks in (("average", module.ema), ("last", module)):
         with torch.no_grad():
@@ -135,3 +135,13 @@ def test_losses_do_not_depend_on_the_number_of_processes(
         for count in map(str, counts):
             assert len(alone[count]) == 8
             assert shared[count] == pytest.approx(alone[count], rel=1e-6, abs=1e-6), count
+
+
+def test_draws_for_held_out_scans_are_not_those_of_training():
+    """Batch 3 of one sample and held-out scan 3 have the same seed and number."""
+    module = stage_module("joint")
+    module._trainer = SimpleNamespace(world_size=1, global_rank=0)
+    held_out, training = module.draw_held_out(torch.tensor([3])), module.draw_path(1, 3)
+    for name, values in held_out._asdict().items():
+        assert values.shape == getattr(training, name).shape
+        assert not torch.equal(values, getattr(training, name)), name

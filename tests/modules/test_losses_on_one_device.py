@@ -10,7 +10,7 @@ import torch
 from one_device import OneDevice
 from tiny_stages import QUIET, STAGES, stage_module
 
-from r3dpa.modules.steps import PathDraws
+from r3dpa.modules.stage import PathDraws
 
 pytestmark = QUIET
 

@@ -13,8 +13,8 @@ from r3dpa.checkpoints import read_checkpoint
 from r3dpa.geometry import NUM_CLASSES, RangeCodec, ScanGeometry, SphericalProjection
 from r3dpa.losses import centred_features, class_errors, masked_mean, return_loss
 from r3dpa.modules import LossWeights, OptimizerConfig, VAEAlignment
-from r3dpa.modules.checks import check_image
-from r3dpa.modules.steps import PathDraws
+from r3dpa.modules.base import check_image
+from r3dpa.modules.stage import PathDraws
 from r3dpa.nn import VAE, PatchDiscriminator, SiT
 
 pytestmark = QUIET
@@ -129,7 +129,9 @@ def test_the_shipped_weights_start_a_vae_with_intensity_and_class():
     shipped = read_checkpoint("r3dpa-s")
     plain = shipped.network("vae").build()
     further = {"intensity": True, "num_classes": NUM_CLASSES}
-    sit = SiT(**{**shipped.network("ema").arguments, "average_blocks": 0, "depth": 6})
+    arguments = shipped.network("ema").arguments
+    del arguments["average_blocks"]
+    sit = SiT(**{**arguments, "depth": 6})
     module = VAEAlignment(
         VAE(**{**shipped.network("vae").arguments, **further}),
         sit,

@@ -16,7 +16,6 @@ from r3dpa.checkpoints import read_checkpoint, save_checkpoint
 from r3dpa.cli import main
 from r3dpa.data import Augmentation
 from r3dpa.modules import LossWeights, flow_matching
-from r3dpa.modules.steps import fit_optimizer
 from r3dpa.nn import Posterior
 
 pytestmark = QUIET
@@ -113,10 +112,10 @@ class TestLayout:
         state = optimizer.state[weight]
         state["exp_avg"] = state["exp_avg"].contiguous()
         before = state["exp_avg"].clone()
-        trainer = SimpleNamespace(precision="32-true" if fused else "16-mixed")
-        fit_optimizer(
-            SimpleNamespace(optimizers=lambda **_: optimizer, device=weight.device, trainer=trainer)
-        )
+        module = stage_module("joint")
+        module.optimizers = lambda **_: optimizer
+        module._trainer = SimpleNamespace(precision="32-true" if fused else "16-mixed")
+        module.on_train_start()
         assert state["exp_avg"].stride() == weight.stride()
         assert torch.equal(state["exp_avg"], before)
         assert optimizer.param_groups[0]["fused"] == fused
@@ -194,10 +193,16 @@ class Syncs(TorchDispatchMode):
 
 
 @pytest.mark.parametrize("stage", ["vae_alignment", "joint", "flow_matching"])
-def test_a_step_waits_for_the_device_once(stage):
+def test_a_step_waits_for_the_device_once(stage, monkeypatch):
     """For the check that the gradients are finite."""
     module, syncs = stage_module(stage), Syncs()
-    counts = []
+    counts, tolist = [], torch.Tensor.tolist
+
+    def counted_tolist(values):  # copies all values to the host at once
+        syncs.count += 1
+        return tolist(values)
+
+    monkeypatch.setattr(torch.Tensor, "tolist", counted_tolist)
 
     def around(step):
         def run(*args, **kwargs):

@@ -7,7 +7,7 @@ import torch
 from tiny_networks import SIT_ARGS
 from torch import nn
 
-from r3dpa.nn import SiT, ThinDecoder
+from r3dpa.nn import AverageVelocitySiT, SiT, ThinDecoder
 
 ARGS = SIT_ARGS | {"depth": 3}
 
@@ -21,7 +21,7 @@ def flow():
 
 
 def few_step(average_blocks=1, sit=None):
-    network = SiT(**ARGS, average_blocks=average_blocks)
+    network = AverageVelocitySiT(average_blocks, **ARGS)
     network.load_state_dict(network.with_average((sit or flow()).state_dict()))
     return network
 
@@ -36,7 +36,7 @@ def test_before_training_the_average_velocity_is_the_velocity_bit_for_bit(blocks
     for target in (time, time / 2, 0 * time):
         assert torch.equal(network.average_velocity(x, time, target), velocity)
     assert torch.equal(network.velocity(x, time), velocity)
-    rows = network.modulations(time, target=0 * time)
+    rows = network.average_modulations(time, 0 * time)
     assert torch.equal(network.average_velocity_at(x, rows), velocity)
 
 
@@ -55,22 +55,22 @@ def test_training_moves_the_average_velocity_alone():
 
 def test_the_length_of_a_step_is_not_rounded_in_half_precision():
     """Blocks in bfloat16; the difference of two times is that of float32."""
-    network = few_step().halve_()
+    network = few_step().to_bfloat16_()
     nn.init.normal_(network.average.embedder.mlp[2].weight, std=0.3)
     time = torch.full((2,), 0.5)
     target = time - torch.tensor([1e-4, 2e-4])
-    rows = network.modulations(time, target=target)
+    rows = network.average_modulations(time, target)
     assert rows.dtype == torch.float32
     assert (rows[0] != rows[1]).any()
     assert network.average_velocity(torch.randn(2, 4, 4, 16), time, target).dtype == torch.float32
 
 
-def test_networks_without_average_velocities_are_refused():
-    x, time = torch.randn(2, 4, 4, 16), torch.rand(2)
-    with pytest.raises(ValueError, match=r"average_blocks 0.*stage few_step"):
-        flow().average_velocity(x, time, time)
-    with pytest.raises(ValueError, match=r"average_blocks must lie in 0..depth = 0..3, got 4"):
-        SiT(**ARGS, average_blocks=4)
+@pytest.mark.parametrize("blocks", [0, 4])
+def test_copies_of_more_blocks_than_there_are_or_of_none_are_refused(blocks):
+    with pytest.raises(
+        ValueError, match=rf"average_blocks must lie in 1..depth = 1..3, got {blocks}"
+    ):
+        AverageVelocitySiT(blocks, **ARGS)
 
 
 def test_a_thin_decoder_has_no_encoder():

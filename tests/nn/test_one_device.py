@@ -61,7 +61,7 @@ def test_velocity_networks(make):
     table = network.modulations(values(5))
     backward(*network(latents, time), features, finish())
     backward(network.project_features(latents, time), network.velocity_at(latents, table[:1]))
-    backward(network.halve_().velocity(latents, time))
+    backward(network.to_bfloat16_().velocity(latents, time))
 
 
 @pytest.mark.parametrize("legacy", [False, True])
@@ -70,7 +70,7 @@ def test_vae_and_discriminator(legacy):
     posterior = vae.encode(values(2, 1, 8, 32))
     latents = posterior.sample(values(*posterior.mean.shape))
     backward(vae.decode(latents), posterior.kl())
-    backward(vae.halve_decoder_().decode(latents))
+    backward(vae.decoder_to_bfloat16_().decode(latents))
     discriminator = on_device(lambda: PatchDiscriminator(channels=8)).train(legacy)
     backward(discriminator(values(2, 1, 32, 64)))
 

@@ -197,7 +197,7 @@ def test_a_class_is_seen_as_a_name_not_as_a_number():
 
 
 def test_in_half_precision_outputs_stay_wide():
-    vae = VAE(**LABELLED).eval().halve_decoder_()
+    vae = VAE(**LABELLED).eval().decoder_to_bfloat16_()
     prediction = vae.predict(torch.zeros(1, 4, 2, 4))
     assert prediction.dtype == torch.float32
     assert vae.decoder.further_out.weight.dtype == torch.float32

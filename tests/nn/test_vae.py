@@ -79,7 +79,7 @@ def test_empty_scan_and_far_latents_are_finite_in_bf16(vae):
 def test_half_decoder_leaves_float32_ends(vae):
     """The image is not rounded to bfloat16, in which neighbours of 0.9 are 0.004 apart."""
     latents = torch.randn(2, vae.latent_channels, 4, 8, generator=torch.Generator().manual_seed(0))
-    half = copy.deepcopy(vae).halve_decoder_()
+    half = copy.deepcopy(vae).decoder_to_bfloat16_()
     narrow = {name for name, p in half.named_parameters() if p.dtype == torch.bfloat16}
     assert all(name.startswith("decoder.") for name in narrow)
     assert not any("norm" in name or "conv_out" in name for name in narrow)

@@ -124,7 +124,7 @@ def test_halved_weights_and_autocast_stay_close(network):
     """Bfloat16 has 8 bits: a percent or two after about ten layers."""
     latents, time = inputs(network)
     velocity, features = network(latents, time)
-    half = copy.deepcopy(network).halve_()
+    half = copy.deepcopy(network).to_bfloat16_()
     assert torch.equal(half.modulations(time), network.modulations(time))
     assert {p.dtype for p in half.parameters()} == {torch.float32, torch.bfloat16}
     assert {p.dtype for p in half.input_layer.parameters()} == {torch.float32}
@@ -217,7 +217,7 @@ def test_half_weights_leave_the_token_stream_in_float32():
     sit, half, all_half = (build(SiT, depth=8) for _ in range(3))
     latents, time = inputs(sit, batch=16)
     expected = sit.velocity(latents, time)
-    error = (half.halve_().velocity(latents, time) - expected).norm()
+    error = (half.to_bfloat16_().velocity(latents, time) - expected).norm()
     naive = all_half.bfloat16().velocity(latents.bfloat16(), time).float()
     assert 0 < error < 0.7 * (naive - expected).norm()
 

@@ -1,4 +1,4 @@
-"""The two velocities of a SiT that guidance extrapolates from."""
+"""The velocity of a SiT, and that with identity attention in one block."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from tiny_networks import SIT_ARGS
 from torch import nn
 
 from r3dpa.nn import SiT
+from r3dpa.nn.perturbed_attention import velocity_and_perturbed
 
 DEPTH = 3
 
@@ -21,14 +22,14 @@ class OwnValue(nn.Module):
         super().__init__()
         self.qkv, self.proj = attention.qkv, attention.proj
 
-    def forward(self, tokens, mixed):
+    def forward(self, tokens, identity_attention):
         width = tokens.shape[-1]
         return self.proj(tokens @ self.qkv.weight[2 * width :].T + self.qkv.bias[2 * width :])
 
 
-def network(guidance_block):
+def network():
     torch.manual_seed(0)
-    sit = SiT(**SIT_ARGS | {"depth": DEPTH}, guidance_block=guidance_block)
+    sit = SiT(**SIT_ARGS | {"depth": DEPTH})
     for parameter in sit.parameters():
         nn.init.normal_(parameter, std=0.3)
     return sit
@@ -38,9 +39,9 @@ def network(guidance_block):
 @pytest.mark.parametrize("times", [1, 3], ids=["one time", "a time of each sample"])
 @torch.no_grad()
 def test_they_are_the_velocity_and_that_without_attention_in_one_block(block, times):
-    sit = network(block)
+    sit = network()
     x, rows = torch.randn(3, 4, 4, 16), sit.modulations(torch.tensor([0.3, 0.6, 0.9])[:times])
-    strong, weak = sit.velocity_pair_at(x, rows)
+    strong, weak = velocity_and_perturbed(sit, x, rows, block)
     torch.testing.assert_close(strong, sit.velocity_at(x, rows), atol=1e-5, rtol=1e-5)
 
     changed = copy.deepcopy(sit)
@@ -52,20 +53,10 @@ def test_they_are_the_velocity_and_that_without_attention_in_one_block(block, ti
 
 @torch.no_grad()
 def test_halved_networks_have_them_in_float32():
-    sit = network(2)
+    sit = network()
     x, rows = torch.randn(2, 4, 4, 16), sit.modulations(torch.tensor([0.5]))
-    exact = sit.velocity_pair_at(x, rows)
-    for half, whole in zip(sit.halve_().velocity_pair_at(x, rows), exact, strict=True):
+    exact = velocity_and_perturbed(sit, x, rows, 2)
+    rounded = velocity_and_perturbed(sit.to_bfloat16_(), x, rows, 2)
+    for half, whole in zip(rounded, exact, strict=True):
         assert half.dtype == torch.float32
         assert (half - whole).norm() < 0.05 * whole.norm()  # 8 bits of mantissa
-
-
-def test_a_block_that_is_not_there_is_refused():
-    with pytest.raises(ValueError, match=r"guidance_block must lie in 0..depth = 0..3.*got 4 and"):
-        network(4)
-    with pytest.raises(ValueError, match="names no guidance_block"):
-        network(0).velocity_pair_at(torch.randn(1, 4, 4, 16), torch.zeros(1, 1))
-    with pytest.raises(ValueError, match=r"guidance_scale 2 needs a guidance_block"):
-        SiT(**SIT_ARGS, guidance_scale=2.0)
-    with pytest.raises(ValueError, match=r"guidance_scale be at least 1, got 1 and 0.5"):
-        SiT(**SIT_ARGS, guidance_block=1, guidance_scale=0.5)

@@ -18,7 +18,7 @@ from r3dpa.data.augmentation import Augmentation
 from r3dpa.data.loaders import training_loader
 from r3dpa.metrics.functional import Moments, frechet_distance, merge_packed
 from r3dpa.modules import LossWeights
-from r3dpa.modules.steps import frozen
+from r3dpa.modules.stage import frozen
 from r3dpa.nn.layers import SyncedBatchNorm2d
 
 pytestmark = pytest.mark.filterwarnings("ignore:Attribute '.*' is an instance of `nn.Module`")

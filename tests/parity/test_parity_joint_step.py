@@ -14,7 +14,7 @@ from torch.utils.data import DataLoader
 from r3dpa import losses
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
 from r3dpa.modules import JointAlignment, LossWeights, OptimizerConfig
-from r3dpa.modules.steps import PathDraws, batch_number
+from r3dpa.modules.stage import PathDraws
 from r3dpa.nn import LatentNorm, PatchDiscriminator
 
 LOSSES = ("alignment_loss", "flow_matching_loss", "generator_loss", "discriminator_loss")
@@ -52,7 +52,7 @@ class Recording(JointAlignment):
 
     def draw_path(self, num_scans, number=None):
         self.steps.append({})
-        values = f"in/step{batch_number(self)}"
+        values = f"in/step{self.batch_number}"
         return PathDraws(
             self.case[f"{values}/posterior_noise"],
             self.case[f"{values}/time_input"].flatten(),

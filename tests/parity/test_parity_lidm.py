@@ -9,7 +9,6 @@ import pytest
 import torch
 from recorded_networks import scaled, weights_of, with_outputs
 
-from r3dpa.baselines import scene_generator
 from r3dpa.baselines.diffusion_paths import StepPath, inpaint
 from r3dpa.baselines.lidm import LiDM, ReleasedDDIM, released_times
 from r3dpa.baselines.lidm_first_stage import LiDMFirstStage
@@ -22,6 +21,7 @@ from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProje
 from r3dpa.losses import generator_loss
 from r3dpa.nn import PatchDiscriminator
 from r3dpa.nn.velocity_network import time_frequencies
+from r3dpa.stages import scene_generator
 
 CALLBACK_MODULE = "pytorch_lightning.callbacks.model_checkpoint"
 # Factors that cases.json does not list, of the released configuration.

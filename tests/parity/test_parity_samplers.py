@@ -6,7 +6,7 @@ import pytest
 import torch
 from recorded_networks import build_sit
 
-from r3dpa.editing.latents import invert, pnp_flow_feature
+from r3dpa.editing.latents import invert
 from r3dpa.flow import (
     FeatureGuidance,
     FeatureTarget,
@@ -17,6 +17,7 @@ from r3dpa.flow import (
     ode_times,
     sde_times,
 )
+from r3dpa.flow.times import batch_time
 
 
 @pytest.fixture(scope="module")
@@ -114,19 +115,19 @@ def transport(case, sit):
 
 
 def inpainting(case, sit):
+    """Plug-and-play with the flow as denoiser (PnP-Flow, alg. 3), which no command offers."""
     config, latents = case.config["pnp"], case["in/pnp_x"]
     assert config["features"] == f"zs[:{len(latents)}]"
     guidance = guidance_of(case, sit, len(latents), "in/pnp_token_mask", config)
-    edited = pnp_flow_feature(
-        guidance.velocity,
-        guidance.term,
-        latents,
-        case["in/pnp_latent_mask"],
-        ode_times(config["num_steps"]),
-        case["in/pnp_noises"],
-        exponent=config["alpha"],
-    )
-    return {"out/pnp_flow_feature": edited}
+    x = torch.zeros_like(latents)
+    times = ode_times(config["num_steps"]).tolist()
+    for now, noise in zip(times, case["in/pnp_noises"], strict=True):
+        time, step = batch_time(now, x), now ** config["alpha"]
+        x = x - step * guidance.term(x, time).to(x.dtype)
+        x = torch.where(case["in/pnp_latent_mask"], x, x - step * (x - latents))
+        noisy = Interpolant().interpolate(x, noise.to(x), time)
+        x = Interpolant().denoise(guidance.velocity(noisy, time), noisy, time).to(x.dtype)
+    return {"out/pnp_flow_feature": x}
 
 
 def scores(case, sit):

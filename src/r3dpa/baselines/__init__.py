@@ -10,7 +10,7 @@ from r3dpa.baselines.lidm_first_stage import LiDMFirstStage
 from r3dpa.baselines.r2dm import R2DM
 from r3dpa.baselines.r2flow import R2Flow
 from r3dpa.baselines.reflow import ReflowPairs
-from r3dpa.baselines.stages import BASELINES, baseline_of, scene_generator
+from r3dpa.baselines.stages import BASELINES, baseline_generator, baseline_of
 
 __all__ = [
     "BASELINES",
@@ -25,6 +25,6 @@ __all__ = [
     "LiDMFirstStage",
     "R2Flow",
     "ReflowPairs",
+    "baseline_generator",
     "baseline_of",
-    "scene_generator",
 ]

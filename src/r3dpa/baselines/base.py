@@ -16,9 +16,8 @@ from r3dpa.data.datasets import LidarBatch
 from r3dpa.flow.interpolant import LINEAR, Interpolant
 from r3dpa.flow.sampler import SamplerConfig
 from r3dpa.flow.solvers import Velocity
-from r3dpa.modules import steps
 from r3dpa.modules.settings import OptimizerConfig, TimeSampling
-from r3dpa.modules.stage import ScanStage
+from r3dpa.modules.stage import Stage
 
 
 class AveragedNetwork(nn.Module):
@@ -55,7 +54,7 @@ class AveragedNetwork(nn.Module):
         return super().train(False)
 
 
-class Baseline(ScanStage):
+class Baseline(Stage):
     """Base of the baselines.
 
     A subclass names its ``stage`` and has its own ``training_step``. To be sampled by every
@@ -128,7 +127,7 @@ class Baseline(ScanStage):
 
     def setup(self, stage: str) -> None:
         """Checks the data, and gives a network with ``coords`` the ray angles of their pixels."""
-        _, geometry = self.attach()
+        _, geometry = self.attach_scans()
         sensor = geometry.projection.sensor
         wanted = (geometry.codec.channels, sensor.beams, sensor.columns)
         if self.image_shape() != wanted:
@@ -161,7 +160,7 @@ class Baseline(ScanStage):
 
     def validation_step(self, batch: LidarBatch, batch_idx: int) -> None:
         """Adds the training loss of the averaged network on held-out scans to the means."""
-        draws = steps.draw_held_out(self, batch["index"])
+        draws = self.draw_held_out(batch["index"])
         data = self.encode(batch["range_image"])
         noise = batch.get("noise", draws.noise)
         errors = self.errors(self.ema.network, data, draws.time, noise)

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from r3dpa.flow.noise import scene_noise
 from r3dpa.flow.sampler import SamplerConfig
-from r3dpa.generation import check_precision, filled, scene_indices
+from r3dpa.generation import check_precision, pad_batch, scene_indices
 from r3dpa.geometry import ScanGeometry
 from r3dpa.scenes import SceneBatch
 
@@ -86,7 +86,7 @@ class BaselineGenerator:
             raise ValueError(f"batch_size is {size}, but {len(indices)} scenes are requested")
         self.calls = 0
         noises = scene_noise(self.baseline.latent_shape, indices, seed)
-        draws = (filled(noise, size).to(self.device) for noise in noises)
+        draws = (pad_batch(noise, size).to(self.device) for noise in noises)
         path = self.baseline.interpolant
         latents = self.sampler.solve(self.velocity, next(draws), draws, path)[: len(indices)]
         return self._scenes(latents)

@@ -24,8 +24,8 @@ from r3dpa.flow.sampler import SamplerConfig
 from r3dpa.flow.sde import ancestral
 from r3dpa.flow.solvers import Velocity
 from r3dpa.flow.times import per_sample
-from r3dpa.modules import steps
 from r3dpa.modules.settings import OptimizerConfig
+from r3dpa.modules.stage import networks_as_settings
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ class LiDM(Baseline):
         super().__init__(
             network, shape, optimizer, lambda step: min(ema_decay, (2 + step) / (11 + step)), seed
         )
-        with steps.networks_as_settings():
+        with networks_as_settings():
             self.save_hyperparameters()
         if first_stage.latent_channels != network.in_channels:
             raise ValueError(
@@ -176,5 +176,5 @@ class LiDM(Baseline):
     def training_step(self, batch: LidarBatch, batch_idx: int) -> Tensor:
         """One step on encoded range images ``(B, 1, H, W)``."""
         latents = self.encode(batch["range_image"])
-        draws = steps.draw_path(self, len(latents))
+        draws = self.draw_path(len(latents))
         return self.log_loss(self.errors(self.network, latents, draws.time, draws.noise).mean())

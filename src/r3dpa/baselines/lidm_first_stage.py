@@ -11,8 +11,8 @@ from r3dpa.baselines.base import Baseline
 from r3dpa.baselines.lidm_networks import VQAutoencoder
 from r3dpa.data.datasets import LidarBatch
 from r3dpa.geometry import unproject
-from r3dpa.modules import steps
 from r3dpa.modules.settings import OptimizerConfig
+from r3dpa.modules.stage import frozen, networks_as_settings, zero_loss
 from r3dpa.nn import PatchDiscriminator
 
 _MOST_WEIGHT = 1e4
@@ -61,7 +61,7 @@ class LiDMFirstStage(Baseline):
     ) -> None:
         shape = (network.latent_channels, 1, 1)
         super().__init__(network, shape, optimizer, None, seed)
-        with steps.networks_as_settings():
+        with networks_as_settings():
             self.save_hyperparameters()
         self.discriminator = discriminator
         self.mask_factor, self.geometry_factor = mask_factor, geometry_factor
@@ -118,7 +118,7 @@ class LiDMFirstStage(Baseline):
 
     def adversarial_loss(self, prediction: Tensor, error: Tensor) -> tuple[Tensor, Tensor]:
         """Weight of the generator's loss by the gradients at the last layer, and that loss."""
-        with steps.frozen(self.discriminator):
+        with frozen(self.discriminator):
             loss = losses.generator_loss(self.logits(prediction))
         last = self.network.get_parameter("decoder.conv_out.weight")
         ours, theirs = (
@@ -152,7 +152,7 @@ class LiDMFirstStage(Baseline):
             parts["adversarial"] = weight * loss
             parts["discriminator"] = self.discriminator_loss(image, prediction, returns)
         else:
-            parts["discriminator"] = steps.zero_loss(self.discriminator)
+            parts["discriminator"] = zero_loss(self.discriminator)
         self.log_dict({f"train/{name}": value.detach() for name, value in parts.items()})
         return self.log_loss(torch.stack(list(parts.values())).sum())
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from r3dpa.nn.discriminator import PatchDiscriminator
-from r3dpa.nn.layers import CircularConv2d, WideCircularConv2d, at_least_float32, no_autocast
+from r3dpa.nn.layers import CircularConv2d, Float32CircularConv2d, at_least_float32, no_autocast
 from r3dpa.nn.unet import UNet
 from r3dpa.nn.vae import VAE, Posterior
 from r3dpa.nn.velocity_network import time_frequencies
@@ -96,7 +96,7 @@ class VQAutoencoder(VAE):
         self.quant_conv = nn.Conv2d(width, width, 1)
         self.quantize = Codebook(num_codes, width, legacy_codebook)
         if mask:
-            self.decoder.conv_out = WideCircularConv2d(channels, 2, (1, 4))
+            self.decoder.conv_out = Float32CircularConv2d(channels, 2, (1, 4))
 
     def encode(self, image: Tensor) -> Posterior:
         """Latents ``(B, C, h, w)`` of images ``(B, 1, H, W)`` in [-1, 1], with next to no variance.

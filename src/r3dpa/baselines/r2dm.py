@@ -22,8 +22,8 @@ from r3dpa.baselines.efficient_unet import EfficientUNet
 from r3dpa.data.datasets import LidarBatch
 from r3dpa.flow.sampler import SamplerConfig
 from r3dpa.flow.times import per_sample
-from r3dpa.modules import steps
 from r3dpa.modules.settings import OptimizerConfig
+from r3dpa.modules.stage import networks_as_settings
 
 RECIPE = OptimizerConfig(betas=(0.9, 0.99), weight_decay=0.0, warmup_steps=10_000, cosine=True)
 
@@ -72,7 +72,7 @@ class R2DM(Baseline):
         decay = partial(ema_decay_at, decay=ema_decay, every=ema_every, after=ema_after)
         shape = (network.in_channels, *network.resolution)
         super().__init__(network, shape, optimizer, decay, seed)
-        with steps.networks_as_settings():
+        with networks_as_settings():
             self.save_hyperparameters()
         self.interpolant: DiffusionPath = DiffusionPath(schedule=schedule, shift=shift)
         self.prediction, self.clip, self.norm = prediction, clip, norm
@@ -108,7 +108,7 @@ class R2DM(Baseline):
     def training_step(self, batch: LidarBatch, batch_idx: int) -> Tensor:
         """One step on images ``(B, C, H, W)`` of range and reflectance."""
         image = batch["range_image"]
-        draws = steps.draw_path(self, len(image))
+        draws = self.draw_path(len(image))
         errors = self.errors(self.network, image, draws.time, draws.noise)
         weights = loss_weight(self.interpolant.log_snr(draws.time), self.prediction, self.gamma)
         return self.log_loss(weighted_mean(errors, weights, self.official_min_snr))

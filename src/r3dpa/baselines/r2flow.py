@@ -14,8 +14,8 @@ from r3dpa.baselines.r2dm import RECIPE, ema_decay_at
 from r3dpa.checkpoints import load_into, read_checkpoint
 from r3dpa.data.datasets import LidarBatch
 from r3dpa.flow.sampler import SamplerConfig
-from r3dpa.modules import steps
 from r3dpa.modules.settings import OptimizerConfig, TimeSampling
+from r3dpa.modules.stage import networks_as_settings
 
 
 class R2Flow(Baseline):
@@ -67,7 +67,7 @@ class R2Flow(Baseline):
         sized: Any = network
         shape = (sized.in_channels, *sized.resolution)
         super().__init__(network, shape, optimizer, decay, seed, time_sampling)
-        with steps.networks_as_settings():
+        with networks_as_settings():
             self.save_hyperparameters()
         self.norm, self.num_steps, self.init_from = norm, num_steps, init_from
         if num_steps is not None:
@@ -96,7 +96,7 @@ class R2Flow(Baseline):
     def training_step(self, batch: LidarBatch, batch_idx: int) -> Tensor:
         """One step on images ``(B, C, H, W)``, with the noise of the batch if it is of pairs."""
         image = batch["range_image"]
-        draws = steps.draw_path(self, len(image))
+        draws = self.draw_path(len(image))
         noise = batch.get("noise", draws.noise)
         return self.log_loss(self.errors(self.network, image, draws.time, noise).mean())
 

@@ -13,7 +13,7 @@ from torch.utils.data import DataLoader, Dataset
 from tqdm import tqdm
 
 from r3dpa.baselines.generator import FULL_SCALE
-from r3dpa.baselines.stages import scene_generator
+from r3dpa.baselines.stages import baseline_generator
 from r3dpa.checkpoints import read_checkpoint, weights_sha256
 from r3dpa.data.loader_module import LoaderModule
 from r3dpa.data.loaders import at_least
@@ -107,7 +107,8 @@ class ReflowPairs(LoaderModule):
 
     def _generated(self, pairs: list[Pair]) -> Iterator[Tensor]:
         """Images ``(B, C, H, W)`` of pairs, in order."""
-        generator = scene_generator(self.checkpoint, self.sampler, device=self.device)
+        checkpoint = read_checkpoint(self.checkpoint)
+        generator = baseline_generator(checkpoint, self.sampler, device=self.device)
         parts = range(0, len(pairs), self.generation_batch)
         for first in tqdm(parts, "generate", unit="batch", disable=None):
             numbers = [pair.number for pair in pairs[first : first + self.generation_batch]]

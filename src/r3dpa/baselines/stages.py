@@ -1,8 +1,7 @@
-"""Scenes from a checkpoint of any stage: R3DPA's own, or those of the baselines."""
+"""The baselines by the stage that their checkpoints name."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any, Literal
 
 from r3dpa.baselines.base import Baseline
@@ -10,44 +9,34 @@ from r3dpa.baselines.generator import BaselineGenerator
 from r3dpa.baselines.lidm import LiDM
 from r3dpa.baselines.r2dm import R2DM
 from r3dpa.baselines.r2flow import R2Flow
-from r3dpa.checkpoints import Checkpoint, read_checkpoint
+from r3dpa.checkpoints import Checkpoint
 from r3dpa.flow.sampler import Quality, SamplerConfig
-from r3dpa.generation import SceneGenerator
 from r3dpa.geometry import ScanGeometry
 from r3dpa.io import usable_device
 
 BASELINES: dict[str, type[Baseline]] = {kind.stage: kind for kind in (R2DM, R2Flow, LiDM)}
 
 
-def scene_generator(
-    checkpoint: str | Path | Checkpoint,
+def baseline_generator(
+    checkpoint: Checkpoint,
     sampler: SamplerConfig | Quality | None = None,
     *,
     weights: Literal["ema", "last"] = "ema",
     device: str = "auto",
     **options: Any,
-) -> SceneGenerator | BaselineGenerator:
-    """Generator of a checkpoint, by the stage that it names.
+) -> BaselineGenerator:
+    """Generator of a checkpoint of a baseline.
 
     Args:
-        checkpoint: File or its content.
-        sampler: Solver and steps, or a quality, which was measured for R3DPA alone. None: ``good``,
-            or the published sampler of a baseline.
+        checkpoint: Content of the checkpoint.
+        sampler: Solver and steps. Default: the published sampler of the baseline.
         weights: Averaged or last weights.
         device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
-        **options: Those of :meth:`r3dpa.SceneGenerator.from_checkpoint`, or of
-            :class:`BaselineGenerator`.
+        **options: See :class:`BaselineGenerator`.
 
     Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: If it cannot be read, or lacks something to sample from.
+        ValueError: If an option is for R3DPA alone, or the checkpoint names no sensor.
     """
-    if not isinstance(checkpoint, Checkpoint):
-        checkpoint = read_checkpoint(checkpoint)
-    if checkpoint.stage not in BASELINES:
-        return SceneGenerator.from_checkpoint(
-            checkpoint, sampler or "good", weights=weights, device=device, **options
-        )
     if isinstance(sampler, str):
         raise ValueError(
             f"quality {sampler} is not measured for stage {checkpoint.stage}: give --solver and "

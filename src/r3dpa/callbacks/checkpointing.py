@@ -93,7 +93,7 @@ class RunCheckpoint(ModelCheckpoint):
         super().on_train_batch_end(trainer, pl_module, *args, **kwargs)
         if trainer.global_step != self._step:  # else gradients are still to be accumulated
             self._step = trainer.global_step
-            self._stop_if_asked(trainer)
+            self._stop_on_signal(trainer)
 
     def on_validation_batch_end(
         self, trainer: L.Trainer, pl_module: L.LightningModule, *args: Any, **kwargs: Any
@@ -103,9 +103,9 @@ class RunCheckpoint(ModelCheckpoint):
         Not with several processes, which may have unequal numbers of batches here.
         """
         if trainer.state.fn == "fit" and not trainer.sanity_checking and trainer.world_size == 1:
-            self._stop_if_asked(trainer)
+            self._stop_on_signal(trainer)
 
-    def _asked(self, trainer: L.Trainer) -> int:
+    def _stop_signal(self, trainer: L.Trainer) -> int:
         """Stop signal received by any process, 0 for none; the same answer in all of them."""
         guard = _guard(trainer)
         if trainer.world_size == 1:
@@ -115,8 +115,8 @@ class RunCheckpoint(ModelCheckpoint):
         received = torch.tensor(self._signal, device=trainer.strategy.root_device)
         return int(trainer.strategy.reduce(received, reduce_op="max"))
 
-    def _stop_if_asked(self, trainer: L.Trainer) -> None:
-        number = self._asked(trainer)
+    def _stop_on_signal(self, trainer: L.Trainer) -> None:
+        number = self._stop_signal(trainer)
         if not number:
             return
         if not self._should_skip_saving_checkpoint(trainer):
@@ -131,7 +131,7 @@ class RunCheckpoint(ModelCheckpoint):
     def _save_last_checkpoint(self, trainer: L.Trainer, monitor_candidates: Any) -> None:
         """Replaces ``last.ckpt`` in a run folder that was moved or copied, too.
 
-        Lightning takes the file there for that of another run and writes ``last-v1.ckpt``.
+        Lightning takes the file there for another run's and writes ``last-v1.ckpt``.
         """
         last = self.format_checkpoint_name(monitor_candidates, self.CHECKPOINT_NAME_LAST)
         self.last_model_path = last

@@ -24,6 +24,8 @@ from torch import Tensor
 from r3dpa import __version__
 from r3dpa.checkpoints.networks import FACTS, Checkpoint, NetworkState, path_of
 from r3dpa.checkpoints.official import OURS, from_official, is_official, statistics_of, to_official
+from r3dpa.checkpoints.older import recorded_sampling
+from r3dpa.class_paths import current_network
 from r3dpa.io import (
     UNPICKLING_ERRORS,
     atomic_path,
@@ -293,6 +295,7 @@ def _from_ours(path: Path) -> Checkpoint:
         facts = {key: about[key] for key in ("step", "official_args", "left_out")}
         facts |= {key: about[key] for key in FACTS if key in about}  # older files have fewer
         configs, sha256 = dict(about["networks"]), about["sha256"]
+        facts["sampling"] = recorded_sampling(facts, configs)
     if sha256 != sha256_of(path):
         raise ValueError(
             f"the file is not the one that {description.name} was written for (SHA-256 differs): "
@@ -326,6 +329,7 @@ def _from_lightning(content: Mapping[str, Any], path: Path) -> Checkpoint:
     others = {key.split(".")[0] for key in weights if not key.startswith(prefixes)}
     facts = {"stage": arguments.get("_class_path", "unknown")}
     facts |= {key: about[key] for key in FACTS if key in about}
+    facts["sampling"] = recorded_sampling(facts, {"sit": arguments.get("sit")})
     return Checkpoint(
         path=path,
         networks=networks,
@@ -341,6 +345,7 @@ def _network(name: str, config: Any, weights: Mapping[str, Tensor]) -> NetworkSt
             f"it does not say which class and arguments its {name} has (found "
             f"{reprlib.repr(config)}); train with `r3dpa fit`, which records them"
         )
+    config = current_network(config)
     return NetworkState(config["class_path"], config.get("init_args") or {}, weights).checked(name)
 
 

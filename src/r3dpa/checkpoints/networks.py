@@ -24,6 +24,7 @@ FACTS = (
     "feature_source",
     "interpolant",
     "settings",
+    "sampling",
     "version",
     "commit",
 )
@@ -119,8 +120,13 @@ class NetworkState:
     @property
     def arguments(self) -> dict[str, Any]:
         """The constructor arguments, defaults included."""
-        parameters = inspect.signature(self.kind).parameters.values()
-        defaults = {p.name: p.default for p in parameters if p.default is not p.empty}
+        defaults: dict[str, Any] = {}
+        for kind in self.kind.__mro__:  # up to the first class that takes no further keywords
+            parameters = inspect.signature(kind).parameters.values()
+            given = {p.name: p.default for p in parameters if p.default is not p.empty}
+            defaults = given | defaults
+            if not any(p.kind is p.VAR_KEYWORD for p in parameters):
+                break
         return defaults | {key: _tuples(value) for key, value in self.init_args.items()}
 
     def new(self) -> nn.Module:
@@ -204,6 +210,7 @@ class Checkpoint:
     feature_source: str | None = None  #: feature source of its last training stage
     interpolant: Literal["linear", "cosine"] = "linear"  #: path from latents to noise of its SiT
     settings: Mapping[str, Any] = field(default_factory=dict)  #: arguments of a baseline
+    sampling: Mapping[str, Any] = field(default_factory=dict)  #: guidance of generated scenes
     version: str | None = None  #: version of r3dpa that wrote it
     commit: str | None = None  #: commit of r3dpa that wrote it
     official_args: Mapping[str, Any] = field(default_factory=dict)  #: official training options

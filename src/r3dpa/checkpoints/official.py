@@ -18,6 +18,8 @@ import torch
 from torch import Tensor, nn
 
 from r3dpa.checkpoints.networks import FACTS, Checkpoint, NetworkState, path_of
+from r3dpa.checkpoints.older import recorded_sampling
+from r3dpa.class_paths import current_network
 from r3dpa.nn.discriminator import PatchDiscriminator
 from r3dpa.nn.latent_norm import LatentNorm
 from r3dpa.nn.sit import SiT
@@ -121,14 +123,17 @@ def _from_ours(content: Mapping[str, Any], path: Path, sit_args: Options) -> Che
         key = next((key for key, names in _SIT_NETWORKS.items() if name in names), name)
         sit, norm = _split(_weights(key, content.get(key)))
         weights = norm if name.endswith("latent_norm") else sit
+        config = current_network(config)
         init_args = {**config["init_args"], **(sit_args if name in ("sit", "ema") else {})}
         networks[name] = NetworkState(config["class_path"], init_args, weights).checked(name)
+    facts = {key: about[key] for key in FACTS if key in about}
+    facts["sampling"] = recorded_sampling(facts, about["networks"])
     return Checkpoint(
         path=path,
         networks=networks,
         step=content.get("steps"),
         official_args=about["official_args"],
-        **{key: about[key] for key in FACTS if key in about},
+        **facts,
     )
 
 

@@ -48,7 +48,7 @@ COMMANDS = {
     "models": Command("r3dpa.pretrained:models", "list trained weights, or show their card"),
     "convert": Command("runs:convert", "convert checkpoints from and to the official layout"),
     "report": Command("runs:report", "draw the loss curves of a run and list the losses"),
-    "replay": Command("runs:replay", "repeat a skipped step to find the layer that failed"),
+    "replay": Command("replay:replay", "repeat a skipped step to find the layer that failed"),
     "ablate": Command("bench:ablate", "train and compare the paper's ablations", resumable=True),
     "bench sampling": Command("bench:sampling", "measure accuracy against sampling time", True),
     "bench training": Command("bench:training", "measure time and memory of training steps"),

@@ -19,7 +19,6 @@ from tqdm import tqdm
 from lidarsim.clouds import PointCloud
 from lidarsim.scan_files import out_of_range, read_clouds
 from r3dpa import viz
-from r3dpa.baselines import BASELINES, scene_generator
 from r3dpa.checkpoints import read_checkpoint
 from r3dpa.cli.parser import EditOptions
 from r3dpa.cli.scene_files import draw_scene, feature_source_of, provenance
@@ -36,6 +35,7 @@ from r3dpa.geometry import Pixels, in_range, project_pixels
 from r3dpa.io import atomic_path, usable_device, write_text
 from r3dpa.nn import VelocityNetwork
 from r3dpa.scenes import SceneBatch
+from r3dpa.stages import BASELINE_STAGES, scene_generator
 
 _SHOWN = 8  # results on the sheet and the page
 
@@ -76,7 +76,7 @@ class EditSession:
         shared: Any = {"weights": options.weights, "device": self.device}
         generator: Any
         self.baseline: Any = None
-        if self.checkpoint.stage in BASELINES:
+        if self.checkpoint.stage in BASELINE_STAGES:
             sampler = SamplerConfig("ddpm", options.steps)
             self.baseline = generator = scene_generator(self.checkpoint, sampler, **shared)
             self._called = generator.network

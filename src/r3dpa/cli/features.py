@@ -17,8 +17,8 @@ from r3dpa.data.feature_grids import features_lock, plan
 from r3dpa.data.scans import Scan
 from r3dpa.features.scalr import SOURCES, feature_source
 from r3dpa.geometry import Projection
-from r3dpa.modules.checks import check_trainer
 from r3dpa.modules.feature_extraction import FeatureExtraction
+from r3dpa.modules.stage import check_trainer
 
 
 def features(args: list[str]) -> None:

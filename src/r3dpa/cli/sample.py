@@ -36,13 +36,13 @@ def sample(
 
     Args:
         num: Number of scenes.
-        quality: Measured solver, steps and shift; default: good, unless one of these is given; of
-            a baseline, its published sampler. ``instant`` needs a checkpoint of stage few_step, as
-            does ``average_velocity``.
+        quality: Measured solver, steps and shift, of which the options below change single ones;
+            default: good, or of a baseline, its published sampler. ``instant`` needs a checkpoint
+            of stage few_step, as does ``average_velocity``.
         solver: ODE solver, ``euler_maruyama`` for the SDE, ``ddpm``, or ``average_velocity`` for 1,
-            2, 4 or 8 steps of any length; default: the SDE.
-        steps: Solver steps; default: 256.
-        shift: Finer steps near noise (above 1) or data (below 1) of the ODE; default: 1.
+            2, 4 or 8 steps of any length.
+        steps: Solver steps.
+        shift: Finer steps near noise (above 1) or data (below 1) of the ODE.
         eta: Noise strength of the SDE; default: 1, as published.
         sde_last: Last SDE step: ``denoise`` (default) or ``mean`` as in the official sampler.
         autoguidance: Snapshot of a weaker model to be guided away from; doubles the evaluations.
@@ -59,24 +59,29 @@ def sample(
     arguments = dict(locals())
     from dataclasses import asdict
 
-    from r3dpa.baselines import scene_generator
     from r3dpa.checkpoints import read_checkpoint, read_snapshot
     from r3dpa.cli.scene_files import draw_all, generate_all, provenance, written
     from r3dpa.data.scene_writer import SceneWriter
+    from r3dpa.flow.sampler import Quality
     from r3dpa.generation import Autoguidance, SamplerConfig
     from r3dpa.io import usable_device
     from r3dpa.nn import ThinDecoder
+    from r3dpa.stages import BASELINE_STAGES, published_sampler, scene_generator
 
     of_solver = ("solver", "steps", "shift", "eta", "sde_last")
     given = {name: arguments[name] for name in of_solver if arguments[name] is not None}
-    if quality is not None and given:
-        raise ValueError(f"--quality {quality} chooses what --{next(iter(given))} gives; drop one")
-    sampler = SamplerConfig(**given) if given else quality
     if autoguidance is None and guidance_interval:
         raise ValueError("--guidance_interval needs --autoguidance")
     files = SceneOptions(**options)
     device = usable_device(files.device)
     checkpoint = read_checkpoint(files.ckpt)
+    sampler: SamplerConfig | Quality | None = quality
+    if given and checkpoint.stage in BASELINE_STAGES:
+        sampler = published_sampler(checkpoint).changed(**given)
+    elif given:
+        sampler = SamplerConfig.of_quality(quality or "good").changed(**given)
+        if decoder is None and quality == "instant" and "thin_decoder" in checkpoint.networks:
+            decoder = "thin"
     guidance, about_guide = None, None
     if autoguidance is not None:
         weak = read_snapshot(autoguidance, checkpoint, files.weights)
@@ -117,7 +122,7 @@ def sample(
     line = f"{num} scenes in {files.out}: {measured['nfe']:.5g} network evaluations each"
     if measured["drawn_by_last_run"]:
         line += f", {measured['seconds_per_scene']:.3g} s a scene"
-    chosen = quality or "good"
-    measured_here = generator.sampler == SamplerConfig.of_quality(chosen)  # not a baseline's
-    note = SamplerConfig.quality_line(chosen) if measured_here and not given else ""
+    note = f"sampler: {generator.sampler.summary}"
+    if not given and generator.sampler == SamplerConfig.of_quality(quality or "good"):
+        note = SamplerConfig.quality_line(quality or "good")  # measured, unlike a baseline's
     return "\n".join(filter(None, (note, line, opened)))

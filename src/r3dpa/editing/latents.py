@@ -12,7 +12,6 @@ Letters: B batch, C latent channels, h x w latent size, T times, ``...`` axes of
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import NamedTuple
 
 import torch
@@ -148,54 +147,6 @@ def slerp(first: Tensor, second: Tensor, share: float) -> Tensor:
     second_weight = torch.where(linear, share, (share * angle).sin() / divisor)
     mean = first_weight[:, None] * flat_first + second_weight[:, None] * flat_second
     return mean.reshape(first.shape).to(first.dtype)
-
-
-@torch.no_grad()
-def pnp_flow_feature(
-    velocity: Velocity,
-    feature_term: Velocity,
-    latents: Tensor,
-    edit_mask: Tensor,
-    times: Tensor,
-    noise: Iterable[Tensor],
-    *,
-    exponent: float = 1.5,
-) -> Tensor:
-    """Inpaint latents towards given features, plug-and-play with the flow as denoiser.
-
-    Starts from zero. At every time, with step ``t^exponent``: a step along the feature term, a
-    step that pulls the surroundings to the given latents, fresh noise to reach time t, and the
-    expected data on the linear path::
-
-        x <- x - t^a feature_term(x, t)
-        x <- x - t^a keep (x - latents)
-        z  = (1 - t) x + t noise
-        x <- z - t v(z, t)
-
-    Source: PnP-Flow (Martin et al. 2025), alg. 3, with the feature term of R3DPA (ICRA 2026).
-
-    Args:
-        velocity: ``(x (B, C, h, w), time (B,)) -> (B, C, h, w)`` without guidance.
-        feature_term: Same signature, see :meth:`r3dpa.flow.guidance.FeatureGuidance.term`.
-        latents: ``(B, C, h, w)`` normalised latents of the scene to edit.
-        edit_mask: Bool, True where latents are generated anew; broadcasts to the latents.
-        times: ``(T,)`` decreasing times from 1 to 0.
-        noise: T Gaussian draws ``(B, C, h, w)``, one per time.
-        exponent: Step sizes are ``t^exponent``.
-    """
-    _check_mask(edit_mask, latents)
-    draws = list(noise)
-    if len(draws) != len(times):
-        raise ValueError(f"one draw per time is needed: {len(times)} times, {len(draws)} draws")
-    x = torch.zeros_like(latents)
-    for now, draw in zip(times.tolist(), draws, strict=True):
-        time = batch_time(now, x)
-        step = now**exponent
-        x = x - step * feature_term(x, time).to(x.dtype)
-        x = torch.where(edit_mask, x, x - step * (x - latents))
-        noisy = LINEAR.interpolate(x, draw.to(x), time)
-        x = LINEAR.denoise(velocity(noisy, time), noisy, time).to(x.dtype)
-    return x
 
 
 def _check_mask(edit_mask: Tensor, latents: Tensor) -> None:

@@ -1,9 +1,14 @@
 """Flow matching without networks: paths, solvers and guidance over velocity functions.
 
-Arguments outside the ranges and shapes that the docstrings state are a ``ValueError``.
+Arguments outside the ranges and shapes that the docstrings state raise a ValueError.
 """
 
-from r3dpa.flow.autoguidance import autoguided, renormalised
+from r3dpa.flow.autoguidance import (
+    PerturbedAttention,
+    autoguided,
+    renormalised,
+    renormalised_times,
+)
 from r3dpa.flow.average_velocity import average_times, average_velocity_steps
 from r3dpa.flow.guidance import FeatureGuidance, FeatureTarget
 from r3dpa.flow.interpolant import Interpolant, sample_time
@@ -15,6 +20,7 @@ from r3dpa.flow.solvers import (
     ab3,
     dpm_solver_pp_2m,
     euler,
+    evaluation_times,
     evaluations,
     heun,
     midpoint,
@@ -29,6 +35,7 @@ __all__ = [
     "FeatureGuidance",
     "FeatureTarget",
     "Interpolant",
+    "PerturbedAttention",
     "Velocity",
     "ab2",
     "ab3",
@@ -38,12 +45,14 @@ __all__ = [
     "dpm_solver_pp_2m",
     "euler",
     "euler_maruyama",
+    "evaluation_times",
     "evaluations",
     "heun",
     "midpoint",
     "ode_solver",
     "ode_times",
     "renormalised",
+    "renormalised_times",
     "sample_time",
     "sde_times",
     "steps_for",

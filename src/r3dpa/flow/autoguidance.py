@@ -1,4 +1,4 @@
-"""Autoguidance: a velocity function pushed away from that of a weaker model of the same data.
+"""Guidance away from a weaker velocity: of another model, or of perturbed attention.
 
 Letters: B batch, C latent channels, ``...`` further axes of the latents.
 """
@@ -6,19 +6,43 @@ Letters: B batch, C latent channels, ``...`` further axes of the latents.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from r3dpa.flow.interpolant import LINEAR, Interpolant
+from r3dpa.flow.interpolant import LINEAR, Interpolant, PathCoefficients
 from r3dpa.flow.solvers import Velocity
 from r3dpa.flow.times import check_interval, per_sample
+
+
+@dataclass(frozen=True)
+class PerturbedAttention:
+    """Guidance of a SiT away from itself without attention between the tokens in one block.
+
+    Formula: ``perturbed + scale (velocity - perturbed)``.
+
+    Source: Ahn et al., "Self-rectifying diffusion sampling with perturbed-attention guidance"
+    (2024).
+
+    Args:
+        block: Perturbed block, counted from 1.
+        scale: Strength, at least 1; 1 for none.
+    """
+
+    block: int
+    scale: float
+
+    def __post_init__(self) -> None:
+        check_scale(self.scale)
+        if self.block < 1:
+            raise ValueError(f"blocks are counted from 1, got block {self.block}")
 
 
 def autoguided(
     velocity: Velocity, weak: Velocity, scale: float, interval: tuple[float, float] = (0.0, 1.0)
 ) -> Velocity:
-    """Velocity extrapolated from that of a weak model through that of the model itself.
+    """Velocity extrapolated from a weak model through the model itself.
 
     Both models err in the same direction, the weak one further: the difference points to the data.
     It needs no classes. Formula: ``weak + scale (velocity - weak)`` at times inside the interval,
@@ -59,7 +83,7 @@ def autoguided(
 
 
 def check_scale(scale: float) -> None:
-    """Raises a ``ValueError`` for a strength of guidance below 1 or not finite."""
+    """Refuses a strength of guidance below 1 or not finite."""
     if not (math.isfinite(scale) and scale >= 1):
         raise ValueError(
             f"the scale of guidance must be a number of 1 or more, got {scale}; 1 is no "
@@ -106,13 +130,7 @@ def renormalised(
 
     def velocity(x: Tensor, time: Tensor) -> Tensor:
         here = interpolant.coefficients(per_sample(time, x))
-        scaled = scale * here.sigma
-        if interpolant.path == "linear":
-            length = here.alpha + scaled
-            there_time = scaled / length
-        else:
-            length = torch.hypot(here.alpha, scaled)
-            there_time = torch.atan2(scaled, here.alpha) * (2 / math.pi)
+        there_time, length = _renormalised_time(here, scale, interpolant)
         there = interpolant.coefficients(there_time)
         offset = shift.to(there_time.dtype).reshape(-1, *[1] * (x.dim() - 2))
         there_x = scale / length * x + there.alpha * offset
@@ -121,3 +139,24 @@ def renormalised(
         return here.d_alpha * (data - offset) / scale + here.d_sigma * noise
 
     return velocity
+
+
+def renormalised_times(
+    times: Tensor, scale: float, shift: Tensor, interpolant: Interpolant = LINEAR
+) -> Tensor:
+    """Times ``(T,)`` at which :func:`renormalised` evaluates the weak model for given times."""
+    if scale == 1 and not shift.any():
+        return times
+    return _renormalised_time(interpolant.coefficients(times), scale, interpolant)[0]
+
+
+def _renormalised_time(
+    here: PathCoefficients, scale: float, interpolant: Interpolant
+) -> tuple[Tensor, Tensor]:
+    """Time t' with ``sigma' / alpha' = scale sigma / alpha``, and ``alpha / alpha'`` there."""
+    scaled = scale * here.sigma
+    if interpolant.path == "linear":
+        length = here.alpha + scaled
+        return scaled / length, length
+    length = torch.hypot(here.alpha, scaled)
+    return torch.atan2(scaled, here.alpha) * (2 / math.pi), length

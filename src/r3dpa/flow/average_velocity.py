@@ -16,17 +16,17 @@ from r3dpa.flow.times import batch_time, ode_times, step_pairs
 
 AverageVelocity = Callable[[Tensor, Tensor, Tensor], Tensor]
 AVERAGE_STEPS = (1, 2, 4, 8)
-TIME_SHIFT = 2.5  # of the times, that of the best AB3 grid
+TIME_SHIFT = 2.5  # of the best AB3 grid
 
 
 def average_times(steps: int) -> Tensor:
-    """Times ``(steps + 1,)`` from 1 to 0; those of fewer steps are among those of 8."""
+    """Times ``(steps + 1,)`` from 1 to 0; fewer steps take some of the times of 8."""
     return ode_times(AVERAGE_STEPS[-1], shift=TIME_SHIFT)[:: AVERAGE_STEPS[-1] // steps]
 
 
 @torch.no_grad()
 def average_velocity_steps(average: AverageVelocity, x: Tensor, times: Tensor) -> Tensor:
-    """State at the last time, by one evaluation a step: ``x + (r - t) u(x, t, r)``."""
+    """State at the last time, by one evaluation per step: ``x + (r - t) u(x, t, r)``."""
     for now, then in step_pairs(times):
         slope = average(x, batch_time(now, x), batch_time(then, x))
         x = x + (then - now) * slope.to(x.dtype)

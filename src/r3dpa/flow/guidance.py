@@ -95,7 +95,7 @@ class FeatureGuidance:
     tokens what ``scale`` says. No term is longer than ``max_ratio |v| sqrt(q)``: neither the steep
     gradients of tokens near pure noise nor few tokens that get all of the term can carry the state
     away. Samples do not influence each other. Where nothing is guided (a scale of 0, no token
-    selected, times outside the interval) the velocity is that of ``velocity`` bit by bit, and no
+    selected, times outside the interval) the velocity equals ``velocity`` bit for bit, and no
     gradient is computed unless another sample needs one. A sample whose gradient is not finite
     goes unguided for that evaluation and is counted.
 
@@ -233,7 +233,7 @@ class FeatureGuidance:
         """Rest of the evaluation, energies ``(B,)`` and their gradient ``(B, ...)``."""
         with torch.inference_mode(False), torch.enable_grad():
             leaf = _at_least_float32(x.detach().clone()).requires_grad_()
-            # A view: module hooks, such as those of torch's FLOP counter, take no leaf.
+            # A view: module hooks, such as torch's FLOP counter, take no leaf.
             features, finish = self._aligned(leaf.view_as(leaf), time.clone())
             energy = self._energy(features)
             (gradient,) = torch.autograd.grad(energy.sum(), leaf)

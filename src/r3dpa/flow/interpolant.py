@@ -2,7 +2,7 @@
 
 Time runs from t = 0 (data) to t = 1 (noise) everywhere. Letters: B batch, ``...`` any further axes.
 Data, noise, ``x`` and velocities are ``(B, ...)``, flow times ``(B,)``; methods raise a
-``ValueError`` for other times.
+ValueError for other times.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class PathCoefficients(NamedTuple):
     d_sigma: Tensor
 
     def data_and_noise(self, x: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor]:
-        """Both of a state by ``x = alpha data + sigma noise, v = d_alpha data + d_sigma noise``."""
+        """Recovers data and noise from a state and its velocity."""
         determinant = self.alpha * self.d_sigma - self.sigma * self.d_alpha
         data = (self.d_sigma * x - self.sigma * velocity) / determinant
         return data, (self.alpha * velocity - self.d_alpha * x) / determinant

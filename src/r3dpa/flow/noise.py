@@ -18,12 +18,12 @@ def scene_noise(shape: tuple[int, int, int], indices: Sequence[int], seed: int) 
 
 
 def scene_uniform(shape: Sequence[int], indices: Sequence[int], seed: int) -> Tensor:
-    """Numbers ``(B, H, W)`` in [0, 1) for the pixels of scenes, on the CPU; not of the noise."""
+    """Uniform draws ``(B, H, W)`` per scene on the CPU, independent of the noise stream."""
     return torch.stack([torch.rand(shape, generator=scene_random(seed, i, 1)) for i in indices])
 
 
 def scene_random(seed: int, index: int, *stream: int) -> torch.Generator:
-    """Random numbers of a scene, on the CPU; those without a stream are of its noise."""
+    """Random numbers of a scene, on the CPU; without a stream, the ones of its noise."""
     return random_generator([seed, index, *stream])
 
 

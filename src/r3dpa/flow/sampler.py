@@ -14,7 +14,7 @@ from torch import Tensor
 from r3dpa.flow.average_velocity import AVERAGE_STEPS, average_times, average_velocity_steps
 from r3dpa.flow.interpolant import Interpolant
 from r3dpa.flow.sde import ancestral, euler_maruyama
-from r3dpa.flow.solvers import ODE_SOLVERS, evaluations, ode_solver
+from r3dpa.flow.solvers import ODE_SOLVERS, evaluation_times, evaluations, ode_solver
 from r3dpa.flow.times import ode_times, sde_times
 
 OdeSolverName = Literal["euler", "heun", "midpoint", "ab2", "ab3", "dpmpp_2m", "unipc"]
@@ -63,11 +63,13 @@ class SamplerConfig:
                 "a sampler needs steps >= 1, shift > 0 and eta >= 0, got "
                 f"{self.steps}, {self.shift} and {self.eta}"
             )
+        if self.solver == "ddpm" and self.eta > 1:
+            raise ValueError(f"eta of ancestral steps must lie in [0, 1], got {self.eta}")
         averages = self.solver == "average_velocity"
         if averages and self.steps not in AVERAGE_STEPS:
             raise ValueError(
-                f"average_velocity takes {', '.join(map(str, AVERAGE_STEPS))} steps, those that "
-                f"stage few_step trains, got {self.steps}"
+                f"average_velocity takes {', '.join(map(str, AVERAGE_STEPS))} steps, as "
+                f"stage few_step trains them, got {self.steps}"
             )
         read = _READS.get(self.solver, ("shift",))
         for name in ("shift", "eta", "sde_last", "sde_last_time"):
@@ -92,6 +94,22 @@ class SamplerConfig:
         level = levels[quality]
         return cls(solver=level["solver"], steps=level["steps"], shift=level["shift"])
 
+    def changed(self, **settings: Any) -> Self:
+        """This sampler with other settings; another solver keeps the settings that it reads."""
+        solver = settings.get("solver", self.solver)
+        read = ("steps", *_READS.get(solver, ("shift",)))
+        kept = {name: getattr(self, name) for name in read}
+        return type(self)(**{"solver": solver, **kept, **settings})
+
+    @property
+    def summary(self) -> str:
+        """Solver, steps, and the settings that differ from their defaults, in one line."""
+        parts = [str(self.solver), f"{self.steps} steps"]
+        for name in ("shift", "eta", "sde_last", "sde_last_time"):
+            if getattr(self, name) != getattr(type(self), name):
+                parts.append(f"{name} {getattr(self, name)}")
+        return ", ".join(parts)
+
     @staticmethod
     def quality_line(quality: Quality) -> str:
         """One line of text about the sampler of :meth:`of_quality`."""
@@ -103,6 +121,20 @@ class SamplerConfig:
             f"{level['seconds_share']:.0%} of the time of best "
             f"(measured on: {table['measured_on']})"
         )
+
+    def times(self) -> Tensor:
+        """Times ``(nfe,)`` float64 at which the velocity is evaluated, in order.
+
+        For ``average_velocity`` these are the starts of its steps, each of which ends at the next.
+        """
+        if self.solver == "average_velocity":
+            return average_times(self.steps)[:-1]
+        if self.solver == "euler_maruyama":
+            return sde_times(self.steps, self.sde_last_time)[:-1]
+        grid = ode_times(self.steps, shift=self.shift)
+        if self.solver in ("ddpm", "ddim"):
+            return grid[:-1]
+        return evaluation_times(self.solver, grid)
 
     def solve(
         self,

@@ -10,7 +10,7 @@ any dtype. Every solver is called ``(velocity, x, times) -> x`` with
 * ``times``: ``(T,)`` times that all increase or all decrease, see
   :func:`r3dpa.flow.times.ode_times`;
 
-returns the ``(B, ...)`` state at the last time, and raises a ``ValueError`` for other times. The
+returns the ``(B, ...)`` state at the last time, and raises a ValueError for other times. The
 orders hold on grids whose steps shrink alike. On a fixed grid ``after_step(x, time, index)`` gets
 the state at ``times[index]`` after every step and returns the state to continue from; multistep
 solvers keep the velocities that they have seen. No solver waits for a GPU.
@@ -191,6 +191,19 @@ def evaluations(solver: str, steps: int) -> int:
     if steps < 1:
         raise ValueError(f"a solver needs at least one step, got {steps}")
     return {"heun": 2 * steps - 1, "midpoint": 2 * steps}.get(solver, steps)
+
+
+def evaluation_times(solver: str, times: Tensor) -> Tensor:
+    """Times ``(T,)`` float64 at which a solver evaluates the velocity on a grid, in order."""
+    _check_name(solver)
+    steps = step_pairs(times)
+    if solver == "heun":
+        ends = [time for step in steps for time in step][:-1]
+    elif solver == "midpoint":
+        ends = [time for now, then in steps for time in (now, (now + then) / 2)]
+    else:
+        ends = [now for now, _ in steps]
+    return torch.tensor(ends, dtype=torch.float64)
 
 
 def steps_for(solver: str, nfe: int) -> int:

@@ -45,7 +45,7 @@ def sde_times(num_steps: int, last: float = 0.04) -> Tensor:
 
 
 def step_pairs(times: Tensor) -> list[tuple[float, float]]:
-    """Start and end of every step; times that turn round or repeat are a ``ValueError``."""
+    """Start and end of every step; raises ValueError unless times are strictly monotonic."""
     if times.dim() != 1 or len(times) < 2:
         raise ValueError(f"a solver needs two or more times, got shape {tuple(times.shape)}")
     steps = list(pairwise(times.tolist()))
@@ -70,7 +70,7 @@ def per_sample(values: Tensor, x: Tensor) -> Tensor:
 
 
 def check_interval(interval: tuple[float, float], name: str) -> None:
-    """Raises a ``ValueError`` if the interval is not two increasing times in [0, 1]."""
+    """Refuses an interval that is not two increasing times in [0, 1]."""
     if not 0 <= interval[0] < interval[1] <= 1:
         raise ValueError(
             f"{name} must be two times 0 <= first < last <= 1 (0 data, 1 noise), "

@@ -1,9 +1,9 @@
-"""Base of the three training modules: start of a stage, optimisation, evaluation, checkpoints."""
+"""Base class of the stages on range images: their start, their losses, evaluation, checkpoints."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any, Literal, cast
 
 import torch
@@ -13,36 +13,29 @@ from torch import Tensor
 from r3dpa import losses
 from r3dpa.checkpoints import Checkpoint, load_into, read_checkpoint, transfer_rgb
 from r3dpa.data.datasets import LidarBatch
-from r3dpa.flow import Interpolant
+from r3dpa.flow import Interpolant, PerturbedAttention
 from r3dpa.flow.sampler import SamplerConfig
 from r3dpa.generation import SceneGenerator
-from r3dpa.geometry import ScanGeometry
+from r3dpa.geometry import RangeCodec, ScanGeometry
 from r3dpa.io import text_table
-from r3dpa.modules import steps
-from r3dpa.modules.checks import (
-    check_features,
-    check_geometry,
-    check_image,
-    check_latents,
-)
 from r3dpa.modules.settings import LossWeights, OptimizerConfig, PathName, TimeSampling
-from r3dpa.modules.stage import ScanStage
-from r3dpa.modules.steps import PathDraws, frozen
+from r3dpa.modules.stage import (
+    PathDraws,
+    Stage,
+    check_latents,
+    frozen,
+    networks_as_settings,
+    zero_loss,
+)
 from r3dpa.nn import EMA, VAE, LatentNorm, PatchDiscriminator, Posterior, SiT, VelocityNetwork
 
 
-class GenerativeModule(ScanStage):
-    """Base of the training modules.
+class GenerativeModule(Stage):
+    """Base class of the stages that train the range-image VAE or the flow over its latents.
 
     A subclass names its stage, lists its networks in :meth:`trainable` and has its own
-    ``training_step``. All losses of a step come from the same forward values, so one optimiser with
-    a parameter group per network and one backward pass equal the official three optimisers stepped
-    in turn; ``accumulate_grad_batches``, ``gradient_clip_val`` (per network), plain ``ddp`` and
-    ``global_step`` keep their usual meaning. Steps that are not finite are skipped by the callback
-    :class:`r3dpa.callbacks.StepGuard`.
-
-    Random numbers of a step are a function of ``(seed, batch, sample)`` alone: they do not depend
-    on the number of processes and need no state for an exact resume.
+    ``training_step``, composed of the losses here. Steps that are not finite are skipped by the
+    callback :class:`r3dpa.callbacks.StepGuard`.
 
     Args:
         vae: Range-image autoencoder.
@@ -62,6 +55,7 @@ class GenerativeModule(ScanStage):
         keep_projector: Keep the RGB model's projection head where its shape fits.
         latent_noise: Largest share of noise in the latents that the decoder learns from, see
             :meth:`decoder_latents`, in the stages that train it; 0 for none.
+        guidance: Perturbed-attention guidance of generated scenes, recorded in checkpoints.
         seed: Key of the training draws.
         channels_last: Keep images and kernels of VAE and discriminator with their channels next to
             each other. The same numbers to rounding; files keep the usual order.
@@ -91,6 +85,7 @@ class GenerativeModule(ScanStage):
         rgb_weights: str | None = None,
         keep_projector: bool = False,
         latent_noise: float = 0.0,
+        guidance: PerturbedAttention | None = None,
         seed: int = 0,
         channels_last: bool = False,
         compile: bool = False,
@@ -98,7 +93,7 @@ class GenerativeModule(ScanStage):
         if not 0 <= latent_noise <= 1:
             raise ValueError(f"model.latent_noise must lie in [0, 1], got {latent_noise}")
         super().__init__(optimizer, seed, time_sampling)
-        with steps.networks_as_settings():
+        with networks_as_settings():
             self.save_hyperparameters()
         self.vae = vae
         self.sit = sit
@@ -109,9 +104,12 @@ class GenerativeModule(ScanStage):
         self.latent_shape = (vae.latent_channels, *sit.input_size)
         self.init_from = init_from
         self.init_networks = self.default_init if init_networks is None else tuple(init_networks)
-        self.rgb_weights, self.keep_projector = rgb_weights, keep_projector
-        self.channels_last, self.compiles = channels_last, compile
+        self.rgb_weights = rgb_weights
+        self.keep_projector = keep_projector
+        self.channels_last = channels_last
+        self.compiles = compile
         self.latent_noise = latent_noise
+        self.guidance = guidance
         self.ema: EMA | None = None
         if self.trains_velocity:
             self.ema = EMA(sit, self.latent_norm, ema_decay, ema_buffers)
@@ -139,7 +137,7 @@ class GenerativeModule(ScanStage):
         The data module may be any that gives :class:`r3dpa.data.LidarBatch` batches and has a
         ``geometry`` after its own setup.
         """
-        datamodule, geometry = self.attach()
+        datamodule, geometry = self.attach_scans()
         sensor = geometry.projection.sensor
         if geometry.codec.reflectance:
             raise ValueError(
@@ -151,15 +149,34 @@ class GenerativeModule(ScanStage):
         if stage != "predict":
             self.feature_source = getattr(datamodule, "feature_source", None)
             if self.needs_features():
-                check_features(self.sit, geometry, datamodule, self.stage)
+                self._check_features(geometry, datamodule)
+
+    def _check_features(self, geometry: ScanGeometry, datamodule: object) -> None:
+        """Refuses data without feature grids, or with grids of another size than the network's."""
+        if getattr(datamodule, "features_dir", "") is None:
+            raise ValueError(
+                f"stage {self.stage} aligns with 3D features, but the data module has none; give "
+                "it an extractor or features_dir, or set the alignment weights to 0"
+            )
+        if tuple(geometry.grid_size) != tuple(self.sit.grid_size):
+            raise ValueError(
+                f"feature grids are {geometry.grid_size}, but the {type(self.sit).__name__} has "
+                f"{tuple(self.sit.grid_size)} tokens; set data.grid_size to the latter"
+            )
+        feature_dim = getattr(datamodule, "feature_dim", self.sit.feature_dim)
+        if feature_dim != self.sit.feature_dim:
+            raise ValueError(
+                f"features have width {feature_dim}, but sit.feature_dim is "
+                f"{self.sit.feature_dim}; set it to the former"
+            )
 
     def on_fit_start(self) -> None:
         """Loads the stage before, unless this run goes on from a checkpoint of its own."""
         if not self._has_weights:
             self.load_previous_stage()
         if self._previous_geometry is not None:
-            there = ScanGeometry.from_dict(dict(self._previous_geometry))
-            check_geometry(there, self.scan_geometry, str(self.init_from))
+            recorded = ScanGeometry.from_dict(dict(self._previous_geometry))
+            self._check_geometry(recorded, str(self.init_from))
 
     def load_previous_stage(self) -> None:
         """Loads ``rgb_weights`` and ``init_from`` and restarts the EMA from the loaded weights.
@@ -173,9 +190,9 @@ class GenerativeModule(ScanStage):
                     "leave rgb_weights out"
                 )
             rgb = read_checkpoint(self.rgb_weights)
-            found = transfer_rgb(rgb, self.sit, self.latent_norm, self.keep_projector)
+            rows = transfer_rgb(rgb, self.sit, self.latent_norm, self.keep_projector)
             heads = ("weights", "tensors", "result", "reason")
-            table = text_table([tuple(map(str, row)) for row in found], heads)
+            table = text_table([tuple(map(str, row)) for row in rows], heads)
             rank_zero_info(f"RGB weights from {self.rgb_weights}\n{table}")
         if self.init_from is not None:
             before = self.previous_networks(read_checkpoint(self.init_from))
@@ -193,8 +210,8 @@ class GenerativeModule(ScanStage):
         """
         networks = {}
         for name, state in before.networks.items():
-            kept = {k: v for k, v in state.state_dict.items() if not k.startswith("average.")}
-            networks[name] = replace(state, state_dict=kept)
+            flow = {k: v for k, v in state.state_dict.items() if not k.startswith("average.")}
+            networks[name] = replace(state, state_dict=flow)
         return replace(before, networks=networks)
 
     # Training
@@ -207,19 +224,20 @@ class GenerativeModule(ScanStage):
         self, image: Tensor, posterior: Posterior, prediction: Tensor
     ) -> dict[str, Tensor]:
         """L_AE: reconstruction, KL and the adversarial term; the discriminator stays untouched."""
-        weights, parts = self.weights, self.reconstruction_losses(image, prediction)
+        weights = self.weights
+        parts = self.reconstruction_losses(image, prediction)
         if weights.kl != 0:
             parts["kl"] = weights.kl * posterior.kl().mean()
         adversarial = weights.adversarial != 0 and self.global_step >= weights.adversarial_start
         if self.discriminator is not None and adversarial:
-            made = self.vae.scan_of(prediction)
+            scan = self.vae.scan_of(prediction)
             if weights.adversarial_ratio is not None:
-                made = losses.balanced_gradient(made, weights.adversarial_ratio)
+                scan = losses.balanced_gradient(scan, weights.adversarial_ratio)
             with frozen(self.discriminator):
-                logits = self.discriminator(made)
+                logits = self.discriminator(scan)
             parts["adversarial"] = weights.adversarial * losses.generator_loss(logits)
         if not parts.keys() & {"reconstruction", "adversarial"}:
-            parts["reconstruction"] = steps.zero_loss(self.vae)
+            parts["reconstruction"] = zero_loss(self.vae)
         return parts
 
     def reconstruction_losses(self, image: Tensor, prediction: Tensor) -> dict[str, Tensor]:
@@ -236,7 +254,8 @@ class GenerativeModule(ScanStage):
     def _range_losses(self, image: Tensor, prediction: Tensor) -> dict[str, Tensor]:
         """Losses ``(B,)`` of images of range and return, of their intensity and class too.
 
-        All but that of returns are means over the pixels with a return, of classes with a label.
+        Means over the pixels with a return, of classes with a label; the loss of returns is one
+        over all pixels.
         """
         outputs = self.vae.outputs_of(prediction)
         ranges, returns = image[:, :1], image[:, 1:2] > 0
@@ -258,12 +277,12 @@ class GenerativeModule(ScanStage):
         return parts
 
     def discriminator_losses(self, image: Tensor, prediction: Tensor) -> dict[str, Tensor]:
-        """Hinge loss on scans and detached reconstructions; a plain 0 before its start."""
+        """Hinge loss on scans and detached reconstructions; zero before `adversarial_start`."""
         if self.discriminator is None:
             return {}
         weights = self.weights
         if weights.discriminator == 0 or self.global_step < weights.adversarial_start:
-            return {"discriminator": steps.zero_loss(self.discriminator)}
+            return {"discriminator": zero_loss(self.discriminator)}
         real = self.discriminator(image[:, : self.vae.in_channels])
         fake = self.discriminator(self.vae.scan_of(prediction).detach())
         loss = losses.discriminator_loss(real, fake)
@@ -295,10 +314,8 @@ class GenerativeModule(ScanStage):
         normalised = self.latent_norm.normalise(latents)
         noisy = self.interpolant.interpolate(normalised, draws.noise, draws.time)
         projected = self.sit.project_features(noisy, draws.time)
-        alignment = steps.align(self, projected, features).mean()
+        alignment = self.alignment_errors(projected, features).mean()
         return {"vae_alignment": self.weights.vae_alignment * alignment}
-
-    flow_losses = steps.flow_losses
 
     # Optimisation
 
@@ -323,21 +340,25 @@ class GenerativeModule(ScanStage):
         """
         image, mask = batch["range_image"], batch["valid_mask"]
         codec = self.scan_geometry.codec
-        draws = steps.draw_held_out(self, batch["index"])
+        draws = self.draw_held_out(batch["index"])
         posterior = self.vae.encode(image)
         prediction = self.vae.predict(posterior.mean)
         reconstruction = self.vae.image_of(prediction)
         error_m = (codec.to_range(reconstruction[:, :1]) - codec.to_range(image[:, :1])).abs()
         networks, features = self.ema or self, batch.get("feature_grid")
         latents = networks.latent_norm.normalise(posterior.sample(draws.posterior_noise))
-        aligns = self.needs_features()
         values: dict[str, Tensor | tuple[Tensor, Tensor]] = {}
-        values |= steps.flow_errors(
-            self, networks.sit, latents, features, draws, self.trains_velocity, aligns
+        values |= self.flow_errors(
+            networks.sit,
+            latents,
+            features,
+            draws,
+            velocity=self.trains_velocity,
+            alignment=self.needs_features(),
         )
         if image.shape[1] == 1:
-            each = steps.each_reconstruction_loss(reconstruction, image, self.weights)
-            values["reconstruction"] = each
+            norm = self.weights.reconstruction_norm
+            values["reconstruction"] = losses.reconstruction_errors(reconstruction, image, norm)
         else:
             values |= self._range_losses(image, prediction)
         if self.vae.num_classes:
@@ -369,19 +390,43 @@ class GenerativeModule(ScanStage):
     ) -> SceneGenerator:
         """Samples from the averaged weights."""
         assert self.ema is not None
-        networks = self.vae, self.ema.sit, self.ema.latent_norm
-        geometry, path = self.scan_geometry, self.interpolant.path
-        return SceneGenerator(*networks, geometry, sampler, path, precision)
+        return SceneGenerator(
+            self.vae,
+            self.ema.sit,
+            self.ema.latent_norm,
+            self.scan_geometry,
+            sampler,
+            self.interpolant.path,
+            precision,
+            guidance=self.guidance,
+        )
 
     # Checkpoints
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Writes weights in the usual order in memory, whatever this run works with."""
+        """Writes weights in the usual order in memory, and how scenes are to be sampled."""
         state = checkpoint["state_dict"]
         checkpoint["state_dict"] = {name: value.contiguous() for name, value in state.items()}
         super().on_save_checkpoint(checkpoint)
+        sampling = {}
+        if self.guidance is not None:
+            sampling["perturbed_attention"] = asdict(self.guidance)
+        checkpoint["r3dpa"]["sampling"] = sampling
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuses the checkpoint of another stage or of other range images."""
         super().on_load_checkpoint(checkpoint)
         self._has_weights = True
+
+
+def check_image(vae: VAE, codec: RangeCodec) -> None:
+    """Refuses a VAE of other images than a codec encodes."""
+    of_vae = f"channels {vae.image_channels}, intensity {vae.intensity}, "
+    of_vae += f"num_classes {vae.num_classes}"
+    of_codec = f"channels {codec.channels}, intensity {codec.intensity_channel}, "
+    of_codec += f"num_classes {codec.num_classes}"
+    if of_vae != of_codec:
+        raise ValueError(
+            f"model.vae is one of images with {of_vae}, but data.codec gives {of_codec}: set "
+            "in_channels, intensity and num_classes of the former to the latter"
+        )

@@ -27,7 +27,7 @@ class FeatureExtraction(LightningModule):
     Args:
         extractor: Frozen network, see :class:`r3dpa.data.Extractor`; its ``prepare`` runs in the
             loader processes.
-        projection: That of the range images; only that of the first process counts. At least one
+        projection: Projection of the range images; only the first process's counts. At least one
             point of a scan must lie within the range limits of its sensor.
         grid_sizes: Rows and columns (h, w) of the grids; all are pooled from one pass.
         features_dir: Folder of the grids of this extractor.

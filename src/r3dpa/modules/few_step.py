@@ -20,11 +20,10 @@ from r3dpa.flow import ab3, average_times, average_velocity_steps, ode_times
 from r3dpa.flow.average_velocity import AVERAGE_STEPS, TIME_SHIFT
 from r3dpa.flow.noise import random_generator
 from r3dpa.flow.times import per_sample
-from r3dpa.modules import steps
 from r3dpa.modules.flow_matching import FlowMatching
 from r3dpa.modules.settings import TimeSampling
-from r3dpa.modules.steps import PathDraws, batch_number
-from r3dpa.nn import VAE, SiT, ThinDecoder
+from r3dpa.modules.stage import PathDraws, zero_loss
+from r3dpa.nn import VAE, AverageVelocitySiT, ThinDecoder
 from r3dpa.nn.layers import num_processes
 
 _POINTS = 8  # of a trajectory after the noise, see average_times
@@ -54,18 +53,17 @@ class _Noise:
 class FewStep(FlowMatching):
     """Average velocities of a frozen flow, learned from its own trajectories, and a thin decoder.
 
-    The copied blocks of the SiT (``average_blocks``) learn the average velocity between points of
-    AB3 trajectories of the flow, whose own weights stay as they are: one checkpoint samples with
-    any solver. The trajectories are computed once, into the folder of the cached posteriors, and an
-    interrupted run goes on with those that are there. The thin decoder learns the images that the
-    VAE decodes from the latents of training scans.
+    The copied blocks of an :class:`r3dpa.nn.AverageVelocitySiT` learn the average velocity between
+    points of AB3 trajectories of the flow, whose own weights stay as they are: one checkpoint
+    samples with any solver. The trajectories are computed once, into the folder of the cached
+    posteriors, and an interrupted run computes only the missing ones. The thin decoder learns the
+    images that the VAE decodes from the latents of training scans.
 
     Source: trajectory regression as in consistency mid-training (Hu et al. 2025).
 
     Args:
         vae: Range-image autoencoder; fixed.
-        sit: SiT with ``average_blocks``, a third of its blocks as a rule. Those of ``init_from``
-            are not used.
+        sit: SiT with a copy of its last blocks. The copy in ``init_from``, if any, is not used.
         thin_decoder: Decoder to distil; None trains none.
         trajectories: Number of trajectories, 16 evaluations each in the precision of the steps.
         **kwargs: See :class:`FlowMatching`. ``init_from`` is a checkpoint of stage flow_matching,
@@ -80,30 +78,23 @@ class FewStep(FlowMatching):
     def __init__(
         self,
         vae: VAE,
-        sit: SiT,
+        sit: AverageVelocitySiT,
         thin_decoder: ThinDecoder | None = None,
         trajectories: int = 4096,
         **kwargs: Any,
     ) -> None:
-        if sit.average is None:
+        if not isinstance(sit, AverageVelocitySiT):
             raise ValueError(
-                "stage few_step trains a copy of the last blocks of the SiT: set "
-                "model.sit.init_args.average_blocks, to a third of its depth as a rule"
+                "stage few_step trains a copy of the last blocks of the SiT: give model.sit the "
+                "class_path r3dpa.nn.AverageVelocitySiT"
             )
         if trajectories < 1:
             raise ValueError(f"model.trajectories must be at least 1, got {trajectories}")
         super().__init__(vae, sit, **kwargs)
         if thin_decoder is not None:
-            for name in (
-                *("in_channels", "latent_channels", "stride", "modes", "least_scale"),
-                *("intensity", "num_classes"),
-            ):
-                theirs, own = getattr(vae, name), getattr(thin_decoder, name)
-                if theirs != own:
-                    raise ValueError(
-                        f"model.thin_decoder: {name} is {own}, but {theirs} of the VAE"
-                    )
-        self.thin_decoder, self.trajectories = thin_decoder, trajectories
+            _check_thin_decoder(thin_decoder, vae)
+        self.thin_decoder = thin_decoder
+        self.trajectories = trajectories
         self.time_sampling: TimeSampling = "uniform"
         self.sit.requires_grad_(False)
         sit.average.requires_grad_(True)
@@ -118,7 +109,7 @@ class FewStep(FlowMatching):
         before = super().previous_networks(before)
         flow = before.network("ema")
         networks = dict(before.networks) | {"latent_norm": before.network("ema_latent_norm")}
-        weights = cast(SiT, self.sit).with_average(flow.state_dict)
+        weights = cast(AverageVelocitySiT, self.sit).with_average(flow.state_dict)
         networks["sit"] = replace(flow, state_dict=weights)
         return replace(before, networks=networks)
 
@@ -178,7 +169,7 @@ class FewStep(FlowMatching):
         ``time``, uniform in [0, 1), selects two of the points.
         """
         draws = super().draw_path(num_samples, number)
-        number = batch_number(self) if number is None else number
+        number = self.batch_number if number is None else number
         world = self.trainer.world_size
         first = number * num_samples * world + self.global_rank
         indices = [(first + i * world) % self.trajectories for i in range(num_samples)]
@@ -199,8 +190,8 @@ class FewStep(FlowMatching):
         x, end = points[each, pair[:, 0]], points[each, pair[:, 1]]
         average = (x - end) / per_sample(time - target, x)
 
-        found = cast(SiT, self.sit).average_velocity(x, time, target)
-        error = losses.flow_matching_loss(found, average)
+        predicted = cast(AverageVelocitySiT, self.sit).average_velocity(x, time, target)
+        error = losses.flow_matching_loss(predicted, average)
         parts = {"denoising": self.weights.denoising * error.mean()}
         return self.weigh_and_log(parts | self._decoder_losses(latents))
 
@@ -208,12 +199,12 @@ class FewStep(FlowMatching):
         self, reconstruction: Tensor, latents: Tensor, draws: PathDraws
     ) -> dict[str, Tensor | tuple[Tensor, Tensor]]:
         """Squared distance of 1 and 4 average steps from the end of AB3; errors of the decoder."""
-        sit = cast(SiT, (self.ema or self).sit)
+        sit = cast(AverageVelocitySiT, (self.ema or self).sit)
         errors: dict[str, Tensor | tuple[Tensor, Tensor]] = {}
         end = ab3(sit.velocity, draws.noise, ode_times(16, shift=TIME_SHIFT))
         for num in (1, 4):
-            found = average_velocity_steps(sit.average_velocity, draws.noise, average_times(num))
-            errors[f"endpoint_{num}"] = losses.flow_matching_loss(found, end)
+            reached = average_velocity_steps(sit.average_velocity, draws.noise, average_times(num))
+            errors[f"endpoint_{num}"] = losses.flow_matching_loss(reached, end)
         if self.thin_decoder is not None:
             geometry, image = self.scan_geometry, self.thin_decoder.decode(latents)
             full, thin = (
@@ -234,10 +225,21 @@ class FewStep(FlowMatching):
         world = num_processes()
         part = [z for i, z in enumerate(latents) if (self.global_rank + i * world) % _DECODED == 0]
         if not part:
-            return {"reconstruction": steps.zero_loss(self.thin_decoder)}
+            return {"reconstruction": zero_loss(self.thin_decoder)}
         with torch.no_grad():
             image = self.vae.decode(torch.stack(part))
-        found = self.reconstruction_losses(image, self.thin_decoder.predict(torch.stack(part)))
+        losses_of_part = self.reconstruction_losses(
+            image, self.thin_decoder.predict(torch.stack(part))
+        )
         num_decoded = math.ceil(world * len(latents) / _DECODED)  # of all processes
         weight = world * len(part) / num_decoded  # the mean over processes is one over the part
-        return {name: weight * loss for name, loss in found.items()}
+        return {name: weight * loss for name, loss in losses_of_part.items()}
+
+
+def _check_thin_decoder(thin_decoder: ThinDecoder, vae: VAE) -> None:
+    """Refuses a thin decoder of other latents or images than the VAE has."""
+    names = ("in_channels", "latent_channels", "stride", "modes", "least_scale")
+    for name in (*names, "intensity", "num_classes"):
+        expected, given = getattr(vae, name), getattr(thin_decoder, name)
+        if given != expected:
+            raise ValueError(f"model.thin_decoder: {name} is {given}, but {expected} of the VAE")

@@ -14,7 +14,7 @@ from r3dpa.data.datasets import LidarBatch
 from r3dpa.data.posterior_cache import cache_posteriors
 from r3dpa.modules.base import GenerativeModule
 from r3dpa.modules.settings import LossWeights
-from r3dpa.modules.steps import PathDraws
+from r3dpa.modules.stage import PathDraws
 from r3dpa.nn import VAE, Posterior, VelocityNetwork
 
 
@@ -30,9 +30,9 @@ class FlowMatching(GenerativeModule):
     Args:
         vae: Range-image autoencoder; its weights come from ``init_from`` and stay fixed.
         sit: Velocity network.
-        weights: Loss weights; those of the VAE are not used here.
+        weights: Loss weights; the ones of the VAE are not used here.
         cache_latents: Encode each training scan once, before the first step, and keep the posterior
-            in ``<run_dir>/latents`` (131 kB a scan at 8 x 16 x 128): a step is then the same, to
+            in ``<run_dir>/latents`` (131 kB per scan at 8 x 16 x 128): a step is then the same, to
             rounding, at a tenth of its cost. Scans may be rotated, but not mirrored.
         latents_dir: Folder of the cached posteriors, which several runs may share; default:
             ``<run_dir>/latents``.
@@ -54,7 +54,8 @@ class FlowMatching(GenerativeModule):
         **kwargs: Any,
     ) -> None:
         super().__init__(vae, sit, weights=weights, **kwargs)
-        self.cache_latents, self.latents_dir = cache_latents, latents_dir
+        self.cache_latents = cache_latents
+        self.latents_dir = latents_dir
         self.vae.requires_grad_(False)
         self.sit.projector.requires_grad_(self.weights.sit_alignment != 0)
 
@@ -121,7 +122,8 @@ class FlowMatching(GenerativeModule):
         """One step on range images or posteriors, and feature grids ``(B, N, D)``."""
         latents, draws = self.draw_latents(batch)
         normalised = self.latent_norm.normalise(latents)
-        return self.weigh_and_log(self.flow_losses(normalised, batch.get("feature_grid"), draws))
+        losses = self.flow_losses(normalised, batch.get("feature_grid"), draws)
+        return self.weigh_and_log(losses)
 
     @torch.no_grad()
     def draw_latents(self, batch: LidarBatch) -> tuple[Tensor, PathDraws]:

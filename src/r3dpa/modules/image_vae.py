@@ -5,23 +5,22 @@ from __future__ import annotations
 from torch import Tensor, nn
 
 from r3dpa.data.image_datamodule import ImageBatch
-from r3dpa.losses import reconstruction_loss
-from r3dpa.modules import steps
-from r3dpa.modules.checks import check_trainer
+from r3dpa.losses import reconstruction_errors, reconstruction_loss
+from r3dpa.modules.image_stage import ImageStage
 from r3dpa.modules.settings import LossWeights, OptimizerConfig
-from r3dpa.modules.stage import ImageStage
+from r3dpa.modules.stage import check_trainer, networks_as_settings
 from r3dpa.nn import ImageVAE
 
 
 class ImageVAETraining(ImageStage):
-    """An image VAE by reconstruction and KL alone.
+    """Trains an image VAE by reconstruction and KL alone.
 
-    No discriminator and no perceptual loss: good enough a latent space for stage 0, not for fine
-    pictures.
+    Without discriminator and perceptual loss its latent space suffices for stage 0, but not for
+    fine pictures.
 
     Args:
         vae: Image autoencoder.
-        weights: Loss weights; those of reconstruction and KL count.
+        weights: Loss weights; ``reconstruction`` and ``kl`` count.
         optimizer: Optimiser settings.
         seed: Key of the training draws.
     """
@@ -36,9 +35,10 @@ class ImageVAETraining(ImageStage):
         seed: int = 0,
     ) -> None:
         super().__init__(optimizer, seed)
-        with steps.networks_as_settings():
+        with networks_as_settings():
             self.save_hyperparameters()
-        self.vae, self.weights = vae, weights
+        self.vae = vae
+        self.weights = weights
 
     def setup(self, stage: str) -> None:
         """Checks trainer and data against the VAE."""
@@ -68,7 +68,7 @@ class ImageVAETraining(ImageStage):
         image = batch["image"]
         posterior = self.vae.encode(image)
         reconstruction = self.vae.decode(posterior.mean)
-        error = steps.each_reconstruction_loss(reconstruction, image, self.weights)
-        self.held_out.update(batch["index"], reconstruction=error, kl=posterior.kl())
+        errors = reconstruction_errors(reconstruction, image, self.weights.reconstruction_norm)
+        self.held_out.update(batch["index"], reconstruction=errors, kl=posterior.kl())
 
     test_step = validation_step

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from r3dpa.data.datasets import LidarBatch
 from r3dpa.modules.base import GenerativeModule
-from r3dpa.modules.steps import frozen
+from r3dpa.modules.stage import frozen
 from r3dpa.nn import VAE, PatchDiscriminator, VelocityNetwork
 
 

@@ -16,7 +16,6 @@ from r3dpa.data.scans import evenly
 from r3dpa.features import PointCloudBatch, ScanGrid, WaffleIron, collate_scans
 from r3dpa.features.scalr import save_weights
 from r3dpa.features.voxels import NUM_TARGETS, MaskedScan, Masking
-from r3dpa.modules import steps
 from r3dpa.modules.settings import OptimizerConfig
 
 _SCANS_TO_QUANTISE = 16
@@ -35,7 +34,7 @@ class PointPretraining(LightningModule):
     BEST-RQ (Chiu et al., 2022) for speech and MaskFeat (Wei et al., 2022) for images.
 
     Args:
-        network: Network to train; its ``cells`` are those of the scans' grid.
+        network: Network to train; its ``cells`` equal the scans' grid.
         lr: Peak learning rate; rises over ``warmup`` steps and falls to 0 as a cosine until
             ``max_steps`` of the trainer.
         weight_decay: Of AdamW, on matrices only.
@@ -135,7 +134,11 @@ class PointPretraining(LightningModule):
         ]
         return torch.optim.AdamW(groups, **self.optimizer_config.adamw())
 
-    on_before_optimizer_step = steps.set_learning_rate
+    def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
+        """Sets the rate of the coming step."""
+        rate = self.optimizer_config.rate(self.global_step, self.trainer.max_steps)
+        for group in optimizer.param_groups:
+            group["lr"] = rate
 
     def on_fit_end(self) -> None:
         """Write ``waffleiron_s.safetensors`` for ``WaffleIronS`` into the run's folder."""

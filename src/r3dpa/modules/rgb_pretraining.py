@@ -14,10 +14,9 @@ from r3dpa.data.images import ImageEntry
 from r3dpa.data.posterior_cache import cache_posteriors
 from r3dpa.data.store import CachedTensors
 from r3dpa.features import DINOv2
-from r3dpa.modules import steps
-from r3dpa.modules.checks import check_latents, check_trainer
+from r3dpa.modules.image_stage import ImageStage
 from r3dpa.modules.settings import LossWeights, OptimizerConfig, TimeSampling
-from r3dpa.modules.stage import ImageStage
+from r3dpa.modules.stage import check_latents, check_trainer, networks_as_settings
 from r3dpa.nn import EMA, ImageVAE, LatentNorm, Posterior, SiT
 
 
@@ -25,7 +24,7 @@ class RGBPretraining(ImageStage):
     """Stage 0: unconditional SiT on image latents, by L_denoise (+ lambda L_align).
 
     The image VAE is frozen: each training image is encoded once, before the first step, and the
-    latent statistics are those of the data set.
+    latent statistics are measured on the data set.
     With a teacher the tokens are aligned with its features of the image (REPA). The checkpoint is
     what ``rgb_weights`` of the other stages takes.
 
@@ -38,7 +37,7 @@ class RGBPretraining(ImageStage):
         teacher: Frozen image network to align with; None aligns with nothing.
         init_from: Trained image VAE: checkpoint of stage ``image_vae``, or the
             ``diffusion_pytorch_model.safetensors`` of a VAE of Stable Diffusion.
-        weights: Loss weights; those of the velocity and of ``sit_alignment`` count. The latter must
+        weights: Loss weights; ``denoising`` and ``sit_alignment`` count. The latter must
             be 0 without a teacher.
         optimizer: Optimiser settings.
         time_sampling: Density of the training times.
@@ -66,7 +65,7 @@ class RGBPretraining(ImageStage):
         seed: int = 0,
     ) -> None:
         super().__init__(optimizer, seed, time_sampling)
-        with steps.networks_as_settings():
+        with networks_as_settings():
             self.save_hyperparameters()
         if (teacher is None) != (weights.sit_alignment == 0):
             raise ValueError(
@@ -78,7 +77,9 @@ class RGBPretraining(ImageStage):
                 f"sit.feature_dim is {sit.feature_dim}, but the teacher's features have width "
                 f"{teacher.dim}; set the former to the latter"
             )
-        self.vae, self.sit, self.weights = vae, sit, weights
+        self.vae = vae
+        self.sit = sit
+        self.weights = weights
         self.latent_shape = (vae.latent_channels, *sit.input_size)
         self.latent_norm = LatentNorm(vae.latent_channels)
         self.ema = EMA(sit, self.latent_norm, ema_decay, ema_buffers)
@@ -86,7 +87,8 @@ class RGBPretraining(ImageStage):
         self.sit.projector.requires_grad_(teacher is not None)
         # In a tuple, so that checkpoints do not hold weights that never change.
         self._teacher = () if teacher is None else (teacher.eval().requires_grad_(False),)
-        self.init_from, self.latents_dir = init_from, latents_dir
+        self.init_from = init_from
+        self.latents_dir = latents_dir
         self._resumed = False
 
     def setup(self, stage: str) -> None:
@@ -123,7 +125,7 @@ class RGBPretraining(ImageStage):
     def _encoded(self) -> CachedTensors[ImageEntry]:
         """Posteriors of all training images; the processes share the work.
 
-        A ``fast_dev_run`` makes those of its batches alone.
+        A ``fast_dev_run`` encodes its batches alone.
         """
         trainer, datamodule = self.trainer, self.images
         entries = datamodule.train_set.entries
@@ -148,7 +150,7 @@ class RGBPretraining(ImageStage):
         posterior = Posterior(batch["posterior_moments"])
         draws = self.draw_path(len(posterior.mean))
         normalised = self.latent_norm.normalise(posterior.sample(draws.posterior_noise))
-        losses = steps.flow_losses(self, normalised, self._features(batch), draws)
+        losses = self.flow_losses(normalised, self._features(batch), draws)
         return self.weigh_and_log(losses)
 
     @torch.no_grad()
@@ -162,10 +164,15 @@ class RGBPretraining(ImageStage):
     def validation_step(self, batch: ImageBatch, batch_idx: int) -> None:
         """Held-out images: the losses of the averaged SiT."""
         posterior = self.vae.encode(batch["image"])
-        draws = steps.draw_held_out(self, batch["index"])
+        draws = self.draw_held_out(batch["index"])
         normalised = self.ema.latent_norm.normalise(posterior.sample(draws.posterior_noise))
-        errors = steps.flow_errors(
-            self, self.ema.sit, normalised, self._features(batch), draws, True, bool(self._teacher)
+        errors = self.flow_errors(
+            self.ema.sit,
+            normalised,
+            self._features(batch),
+            draws,
+            velocity=True,
+            alignment=bool(self._teacher),
         )
         self.held_out.update(batch["index"], **errors)
 

@@ -25,9 +25,11 @@ class LossWeights:
         classes: Weight of the cross-entropy of the class of labelled returns, likewise.
         kl: Weight of the Kullback-Leibler term, summed per sample.
         adversarial: Weight of the generator's adversarial loss (official 0.3 x 0.001).
-        adversarial_ratio: Length of the adversarial gradient at the image, relative to that of an
-            L1 loss, in place of the weight; None: the weight, with which the discriminator wins.
-        discriminator: Factor of the discriminator's hinge loss, without effect on steps of AdamW.
+        adversarial_ratio: Target ratio of adversarial to L1 gradient norm at the image (adaptive
+            weight of VQGAN). Overrides ``adversarial``. Default: fixed weight, at which the
+            discriminator dominates.
+        discriminator: Factor of the discriminator's hinge loss. AdamW is invariant to this scale;
+            it only affects clipping and logs.
         adversarial_start: First step at which both adversarial losses count.
         vae_alignment: lambda1, weight of the alignment loss that reaches the VAE.
         denoising: Weight of the velocity error.

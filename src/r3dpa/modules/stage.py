@@ -1,109 +1,120 @@
-"""Bases of the stages: optimiser, held-out losses and checkpoints, on scans or RGB images."""
+"""Base class of all training stages, and the random draws and held-out means that they share."""
 
 from __future__ import annotations
 
+import warnings
 from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict
-from typing import Any
+from typing import Any, NamedTuple, cast
 
 import lightning as L
 import torch
+from lightning.pytorch.callbacks import StochasticWeightAveraging
 from torch import Tensor, nn
+from torchmetrics import Metric
+from torchmetrics.utilities import dim_zero_cat
 
-from r3dpa import __version__
+from r3dpa import __version__, losses
 from r3dpa.data.augmentation import Augmentation
-from r3dpa.data.image_datamodule import ImageDataModule
-from r3dpa.flow.interpolant import LINEAR, Interpolant
+from r3dpa.flow.interpolant import LINEAR, Interpolant, sample_time
 from r3dpa.geometry import ScanGeometry
 from r3dpa.io import source_commit
-from r3dpa.modules import steps
-from r3dpa.modules.checks import check_geometry, check_trainer, geometry_of
-from r3dpa.modules.settings import OptimizerConfig, TimeSampling
-from r3dpa.nn import ImageVAE
+from r3dpa.modules.settings import LossWeights, OptimizerConfig, TimeSampling
+from r3dpa.nn import VAE, ImageVAE, VelocityNetwork
+
+_PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")
+
+
+class PathDraws(NamedTuple):
+    """Random numbers of one training step.
+
+    ``posterior_noise`` and ``noise`` are ``(B, C, h, w)`` standard normal, ``time`` is ``(B,)``,
+    and ``uniform`` ``(B,)`` in [0, 1) selects the noise on the latents of a decoder; empty in draws
+    for steps without.
+    """
+
+    posterior_noise: Tensor
+    time: Tensor
+    noise: Tensor
+    uniform: Tensor = torch.empty(0)
 
 
 class Stage(L.LightningModule, ABC):
-    """Optimiser, losses of held-out samples, and checkpoints that name their stage.
+    """Base class of all training stages.
+
+    It owns the random draws of a step, the optimiser and its clipping, the means over held-out
+    samples, and the facts that a checkpoint records. All losses of a step come from the same
+    forward values, so one AdamW with a parameter group per network and one backward pass equal
+    several optimisers stepped in turn; ``accumulate_grad_batches``, ``gradient_clip_val`` (per
+    network), plain ``ddp`` and ``global_step`` keep their usual meaning.
 
     Random numbers of a step are a function of ``(seed, batch, sample)`` alone: they do not depend
     on the number of processes or on where a run was interrupted.
+
+    A subclass names its ``stage``, sets ``latent_shape`` and lists its networks in
+    :meth:`trainable`. Stages with loss weights set ``weights``, stages of a flow ``sit`` too.
 
     Args:
         optimizer: Optimiser settings.
         seed: Key of the training draws.
         time_sampling: Density of the training times.
+
+    Attributes:
+        latent_shape: Channels, rows and columns ``(C, h, w)`` of the samples that are drawn.
+        geometry: Projection and range encoding of the scans, from setup or a checkpoint; None
+            before, and in stages on RGB images.
+        loaded_step: Optimiser steps of the checkpoint that was loaded.
+        logged_losses: Losses of the last training batch, read by the step guard.
+        step_skipped: Whether the step guard skipped the last step.
     """
 
     stage: str
+    latent_shape: tuple[int, ...]
+    weights: LossWeights
+    sit: VelocityNetwork
     interpolant: Interpolant = LINEAR
-
-    def __init__(
-        self, optimizer: OptimizerConfig, seed: int, time_sampling: TimeSampling = "uniform"
-    ) -> None:
-        super().__init__()
-        self.optimizer_config, self.seed, self.time_sampling = optimizer, seed, time_sampling
-        self.held_out = steps.HeldOutMeans()
-        self.logged_losses: dict[str, Tensor] = {}  # of the last training batch
-        self.step_skipped = False  # set by StepGuard
-
-    @abstractmethod
-    def trainable(self) -> dict[str, nn.Module]:
-        """Networks that this stage trains, by name; frozen parameters inside stay frozen."""
-
-    draw_path = steps.draw_path
-    weigh_and_log = steps.weigh_and_log
-
-    def configure_optimizers(self) -> torch.optim.Optimizer:
-        """One AdamW with a parameter group per trained network, fused where the device has it."""
-        groups = [
-            {"params": [p for p in network.parameters() if p.requires_grad], "name": name}
-            for name, network in self.trainable().items()
-        ]
-        settings = self.optimizer_config.adamw()
-        return torch.optim.AdamW(groups, **settings, fused=steps.uses_fused(self))
-
-    configure_gradient_clipping = steps.clip_per_network
-    on_before_optimizer_step = steps.set_learning_rate
-    on_train_start = steps.fit_optimizer
-    on_validation_epoch_end = on_test_epoch_end = steps.log_held_out
-
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Adds stage, interpolant and version."""
-        checkpoint["r3dpa"] = {
-            "stage": self.stage,
-            "interpolant": self.interpolant.path,
-            "version": __version__,
-            "commit": source_commit(),
-        }
-
-    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuses the checkpoint of another stage; optimiser settings stay those of this run."""
-        found = checkpoint.get("r3dpa", {}).get("stage")
-        if found != self.stage:
-            raise ValueError(
-                f"the checkpoint is of stage {found!r}, this is {self.stage!r}; to start a stage "
-                "from another one, give model.init_from instead of ckpt_path"
-            )
-        for state in checkpoint.get("optimizer_states", []):
-            for group in state["param_groups"]:
-                group.update(self.optimizer_config.adamw())
-
-
-class ScanStage(Stage):
-    """Base of the stages on range images, whose checkpoints hold the geometry of the scans."""
-
     geometry: ScanGeometry | None = None
     augmentation: Augmentation | None = None
     feature_source: str | None = None
     loaded_step = 0
 
-    def attach(self) -> tuple[Any, ScanGeometry]:
-        """Checks the trainer and keeps the scan geometry; returns data module and geometry."""
+    def __init__(
+        self, optimizer: OptimizerConfig, seed: int, time_sampling: TimeSampling = "uniform"
+    ) -> None:
+        super().__init__()
+        self.optimizer_config = optimizer
+        self.seed = seed
+        self.time_sampling: TimeSampling = time_sampling
+        self.held_out = HeldOutMeans()
+        self.logged_losses: dict[str, Tensor] = {}
+        self.grad_norms: dict[str, Tensor] | None = None  # of this step, if the guard has them
+        self.step_skipped = False
+
+    @abstractmethod
+    def trainable(self) -> dict[str, nn.Module]:
+        """Networks that this stage trains, by name; frozen parameters inside stay frozen."""
+
+    # Data
+
+    def attach_scans(self) -> tuple[Any, ScanGeometry]:
+        """Data module and scan geometry, after a check of the trainer; keeps what files record.
+
+        The data module may be any that gives :class:`r3dpa.data.LidarBatch` batches.
+        """
         check_trainer(self.trainer)
         datamodule = getattr(self.trainer, "datamodule", None)
-        self.geometry = geometry_of(datamodule, self)
+        geometry = getattr(datamodule, "geometry", None)
+        if not isinstance(geometry, ScanGeometry):
+            raise ValueError(
+                f"data.class_path: {type(self).__name__} needs a data module that gives "
+                "r3dpa.data.LidarBatch batches and has a geometry (r3dpa.geometry.ScanGeometry), "
+                f"such as r3dpa.data.LidarDataModule, got {type(datamodule).__name__}"
+            )
+        self.geometry = geometry
         self.augmentation = getattr(datamodule, "augmentation", None)
-        return datamodule, self.geometry
+        return datamodule, geometry
 
     @property
     def scan_geometry(self) -> ScanGeometry:
@@ -112,43 +123,352 @@ class ScanStage(Stage):
             raise RuntimeError("the module has no scan geometry yet: set it up with a data module")
         return self.geometry
 
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Adds stage and scan geometry, enough to sample from, and what it was trained with."""
-        super().on_save_checkpoint(checkpoint)
-        checkpoint["r3dpa"] |= {
-            "geometry": self.scan_geometry.to_dict(),
-            "augmentation": None if self.augmentation is None else asdict(self.augmentation),
-            "feature_source": self.feature_source,
-        }
-
-    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuses the checkpoint of another stage or of other range images, and keeps its step."""
-        self.loaded_step = checkpoint.get("global_step", 0)
-        super().on_load_checkpoint(checkpoint)
-        there = ScanGeometry.from_dict(checkpoint["r3dpa"]["geometry"])
-        if self.geometry is None:
-            self.geometry = there
-        else:
-            check_geometry(there, self.geometry, "the checkpoint")
-
-
-class ImageStage(Stage):
-    """Base of the stages on RGB images, whose checkpoints say which."""
-
-    vae: ImageVAE
+    # Random draws
 
     @property
-    def images(self) -> ImageDataModule:
-        """Data module, whose images are of a size that the VAE can encode."""
-        found = getattr(self.trainer, "datamodule", None)
-        if not isinstance(found, ImageDataModule):
+    def batch_number(self) -> int:
+        """Training batches before this one, over all epochs and resumed runs."""
+        return self.trainer.fit_loop.epoch_loop.total_batch_idx
+
+    def draw_path(self, num_samples: int, number: int | None = None) -> PathDraws:
+        """Posterior noise, times and path noise for this process's part of a global batch.
+
+        They are a function of ``(seed, batch, sample)``, whatever the number of processes.
+
+        Args:
+            num_samples: Samples B of the batch on this process.
+            number: Number of the batch since the start of training. Default: the batch at hand.
+        """
+        world, rank = self.trainer.world_size, self.trainer.global_rank
+        number = self.batch_number if number is None else number
+        draws = self._draw([self.seed, 0, number], num_samples * world)
+        return PathDraws(*(values[rank::world] for values in draws))
+
+    def draw_held_out(self, index: Tensor) -> PathDraws:
+        """Draws for held-out samples ``(B,)``, a function of ``(seed, index)``."""
+        each = [self._draw([self.seed, 1, number], 1) for number in index.tolist()]
+        return PathDraws(*map(torch.cat, zip(*each, strict=True)))
+
+    def _draw(self, key: list[int], total: int) -> PathDraws:
+        generator = random_generator(key, self.device, bits=32)
+        shape = (total, *self.latent_shape)
+        return PathDraws(
+            torch.randn(shape, generator=generator, device=self.device),
+            sample_time(total, self.time_sampling, generator=generator),
+            torch.randn(shape, generator=generator, device=self.device),
+            torch.rand(total, generator=generator, device=self.device),
+        )
+
+    # Losses
+
+    def flow_errors(
+        self,
+        sit: VelocityNetwork,
+        latents: Tensor,
+        features: Tensor | None,
+        draws: PathDraws,
+        *,
+        velocity: bool,
+        alignment: bool,
+    ) -> dict[str, Tensor]:
+        """L_denoise and L_align, each ``(B,)``, of normalised latents: those requested, by name."""
+        noisy = self.interpolant.interpolate(latents, draws.noise, draws.time)
+        predicted, projected = None, None
+        if velocity and alignment:
+            predicted, projected = sit(noisy, draws.time)
+        elif velocity:
+            predicted = sit.velocity(noisy, draws.time)
+        elif alignment:
+            projected = sit.project_features(noisy, draws.time)
+        errors = {}
+        if predicted is not None:
+            target = self.interpolant.target(latents, draws.noise, draws.time)
+            errors["denoising"] = losses.flow_matching_loss(predicted, target)
+        if projected is not None:
+            errors["alignment"] = self.alignment_errors(projected, features)
+        return errors
+
+    def flow_losses(
+        self, normalised: Tensor, features: Tensor | None, draws: PathDraws
+    ) -> dict[str, Tensor]:
+        """L_denoise + lambda2 L_align on normalised latents without gradient."""
+        weights = self.weights
+        trains_velocity = weights.denoising != 0
+        stopped = weights.alignment_stop is not None and self.global_step >= weights.alignment_stop
+        aligns = weights.sit_alignment != 0 and not stopped
+        errors = self.flow_errors(
+            self.sit, normalised, features, draws, velocity=trains_velocity, alignment=aligns
+        )
+        if trains_velocity:
+            parts = {"denoising": weights.denoising * errors["denoising"].mean()}
+        else:
+            parts = {"denoising": zero_loss(self.sit)}
+        if aligns:
+            parts["sit_alignment"] = weights.sit_alignment * errors["alignment"].mean()
+        elif weights.sit_alignment != 0:
+            parts["sit_alignment"] = zero_loss(self.sit.projector)
+        return parts
+
+    def alignment_errors(self, projected: Tensor, features: Tensor | None) -> Tensor:
+        """L_align ``(B,)`` of projected tokens and feature grids, both ``(B, N, D)``."""
+        if features is None:
             raise ValueError(
-                f"{type(self).__name__} needs an ImageDataModule, got {type(found).__name__}"
+                f"stage {self.stage} aligns with 3D features, but the batch holds no feature_grid"
             )
-        self.vae.latent_size((found.image_size, found.image_size))
-        return found
+        if self.weights.centre_features:
+            features = losses.centred_features(features)
+        skip = self.weights.skip_empty_cells
+        return losses.alignment_loss(projected, features, skip_empty_cells=skip)
+
+    def weigh_and_log(self, parts: Mapping[str, Tensor]) -> Tensor:
+        """Sum of weighted losses; logs it as ``train/loss``, and each loss without its weight.
+
+        The logged values are kept in ``logged_losses``; losses of weight 0 are not logged.
+        """
+        total = torch.stack(list(parts.values())).sum()
+        factors = {name: getattr(self.weights, name) for name in parts}
+        values = {n: value.detach() / factors[n] for n, value in parts.items() if factors[n] != 0}
+        values["loss"] = total.detach()
+        self.logged_losses = values
+        self.log_dict({f"train/{name}": value for name, value in values.items()})
+        return total
+
+    # Optimisation
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        """One AdamW with a parameter group per trained network, fused where the device has it."""
+        groups = [
+            {"params": [p for p in network.parameters() if p.requires_grad], "name": name}
+            for name, network in self.trainable().items()
+        ]
+        settings = self.optimizer_config.adamw()
+        return torch.optim.AdamW(groups, **settings, fused=self._uses_fused_optimizer())
+
+    def _uses_fused_optimizer(self) -> bool:
+        """Whether to use fused AdamW.
+
+        Not with float16, where it would unscale the gradients after clipping.
+        """
+        supported = self.device.type in ("cpu", "cuda", "mps", "xpu")
+        return supported and self.trainer.precision != "16-mixed"
+
+    def on_train_start(self) -> None:
+        """Restores a resumed optimiser to its device and to the memory format of the weights.
+
+        A fused optimiser walks through the memory of weights and moments alike, unchecked.
+        """
+        optimizer = cast(torch.optim.Optimizer, self.optimizers(use_pl_optimizer=False))
+        fused = self._uses_fused_optimizer()
+        for group in optimizer.param_groups:
+            group["fused"] = fused
+        for parameter, state in optimizer.state.items():
+            state["step"] = state["step"].to(parameter.device if fused else "cpu")
+            for name in ("exp_avg", "exp_avg_sq"):
+                if state[name].stride() != parameter.stride():
+                    state[name] = torch.empty_like(parameter).copy_(state[name])
+
+    def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
+        """Sets the rate of the coming step, a function of its number alone."""
+        config = self.optimizer_config
+        rate = config.rate(self.global_step, self.trainer.max_steps)
+        relative = {
+            "discriminator": config.discriminator_rate,
+            "thin_decoder": config.thin_decoder_rate,
+        }
+        for group in optimizer.param_groups:
+            group["lr"] = relative.get(group["name"], 1.0) * rate
+
+    def configure_gradient_clipping(
+        self,
+        optimizer: torch.optim.Optimizer,
+        gradient_clip_val: int | float | None = None,
+        gradient_clip_algorithm: str | None = None,
+    ) -> None:
+        """Clips each network's gradient norm by itself and logs it as ``grad_norm/<network>``."""
+        algorithm = gradient_clip_algorithm
+        if algorithm not in (None, "norm"):
+            raise ValueError(
+                "gradients are clipped by norm per network; leave gradient_clip_algorithm out, got "
+                f"{getattr(algorithm, 'value', algorithm)!r}"
+            )
+        norms = self.grad_norms or gradient_norms(optimizer, self.device)
+        self.grad_norms = None
+        self.log_dict({f"grad_norm/{name}": norm for name, norm in norms.items()})
+        limit = float(gradient_clip_val or 0)
+        limit = limit if limit > 0 else float("inf")  # 0 and below: no clipping, as in Lightning
+        for group in optimizer.param_groups:
+            nn.utils.clip_grads_with_norm_(group["params"], limit, norms[group["name"]])
+
+    # Held-out samples
+
+    def on_validation_epoch_end(self) -> None:
+        """Logs the means over the held-out samples as ``val/<name>``."""
+        self._log_held_out("val")
+
+    def on_test_epoch_end(self) -> None:
+        """Logs the means over the held-out samples as ``test/<name>``."""
+        self._log_held_out("test")
+
+    def _log_held_out(self, split: str) -> None:
+        means = self.held_out.compute()
+        self.log_dict({f"{split}/{name}": mean for name, mean in means.items()})
+        self.held_out.reset()
+
+    # Checkpoints
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Adds the stage and the images that it was trained with."""
-        super().on_save_checkpoint(checkpoint)
-        checkpoint["r3dpa"]["images"] = self.images.settings
+        """Adds stage, interpolant and version, and of scans what sampling and a resume need."""
+        facts: dict[str, Any] = {
+            "stage": self.stage,
+            "interpolant": self.interpolant.path,
+            "version": __version__,
+            "commit": source_commit(),
+        }
+        if self.geometry is not None:
+            facts["geometry"] = self.geometry.to_dict()
+            facts["augmentation"] = None if self.augmentation is None else asdict(self.augmentation)
+            facts["feature_source"] = self.feature_source
+        checkpoint["r3dpa"] = facts
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Refuses the checkpoint of another stage or of other range images, and keeps its step.
+
+        Optimiser settings stay as this run has them.
+        """
+        self.loaded_step = checkpoint.get("global_step", 0)
+        facts = checkpoint.get("r3dpa", {})
+        if facts.get("stage") != self.stage:
+            raise ValueError(
+                f"the checkpoint is of stage {facts.get('stage')!r}, this is {self.stage!r}; to "
+                "start a stage from another one, give model.init_from instead of ckpt_path"
+            )
+        for state in checkpoint.get("optimizer_states", []):
+            for group in state["param_groups"]:
+                group.update(self.optimizer_config.adamw())
+        if "geometry" in facts:
+            self._check_geometry(ScanGeometry.from_dict(facts["geometry"]), "the checkpoint")
+
+    def _check_geometry(self, recorded: ScanGeometry, source: str) -> None:
+        """Refuses weights that were trained on other range images than this run's."""
+        if self.geometry is None:
+            self.geometry = recorded
+        for name in ("projection", "codec"):
+            theirs, ours = getattr(recorded, name), getattr(self.geometry, name)
+            if theirs != ours:
+                raise ValueError(
+                    f"{source} was trained on other range images: {name} {theirs} there, {ours} "
+                    "here. Set sensor, projection and codec of the data module to those of the "
+                    "checkpoint"
+                )
+
+
+class HeldOutMeans(Metric):
+    """Means over held-out samples, each counted once, whatever the batches and processes.
+
+    Loaders of several processes repeat samples to give all of them the same number of batches.
+    """
+
+    full_state_update = False
+    index: list[Tensor]
+    values: list[Tensor]
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.names: tuple[str, ...] = ()
+        self.add_state("index", [], dist_reduce_fx="cat")
+        self.add_state("values", [], dist_reduce_fx="cat")
+
+    def update(self, index: Tensor, **sums: Tensor | tuple[Tensor, Tensor]) -> None:
+        """Adds samples by their index ``(B,)``: a value ``(B,)`` each, or its sum and weight."""
+        pairs = [s if isinstance(s, tuple) else (s, torch.ones_like(s)) for s in sums.values()]
+        self.names = tuple(sums)
+        self.index.append(index)
+        self.values.append(torch.stack([torch.stack(pair, dim=1).float() for pair in pairs], dim=1))
+
+    def compute(self) -> dict[str, float]:
+        """Means by name; 0 where all weights are 0."""
+        index, order = dim_zero_cat(self.index).cpu().sort(stable=True)
+        once = order[index.diff(prepend=index[:1] - 1) != 0]
+        total, weight = dim_zero_cat(self.values).cpu()[once].double().sum(dim=0).unbind(dim=1)
+        return dict(zip(self.names, (total / weight.clamp(min=1)).tolist(), strict=True))
+
+
+@contextmanager
+def networks_as_settings() -> Iterator[None]:
+    """For ``save_hyperparameters()``, without Lightning's advice to leave networks out.
+
+    Kept, they are class paths in a checkpoint of the CLI, from which the networks are rebuilt.
+    """
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Attribute '.*' is an instance of `nn.Module`")
+        yield
+
+
+@contextmanager
+def frozen(*networks: nn.Module) -> Iterator[None]:
+    """Records the forward pass inside without gradients to the networks' own parameters.
+
+    Gradients still flow through the networks to their inputs.
+    """
+    parameters = [p for network in networks for p in network.parameters() if p.requires_grad]
+    for parameter in parameters:
+        parameter.requires_grad_(False)
+    try:
+        yield
+    finally:
+        for parameter in parameters:
+            parameter.requires_grad_(True)
+
+
+def zero_loss(network: nn.Module) -> Tensor:
+    """Loss of exactly 0 that gives each trained parameter a gradient of 0, at no cost.
+
+    Under DDP each trained network must take part in each step.
+    """
+    empty = [p.flatten()[:0].sum() for p in network.parameters() if p.requires_grad]
+    return torch.stack(empty).sum()
+
+
+def gradient_norms(optimizer: torch.optim.Optimizer, device: torch.device) -> dict[str, Tensor]:
+    """Gradient norm of each parameter group by its name, on the device."""
+    return {
+        group.get("name", str(index)): nn.utils.get_total_norm(
+            [p.grad for p in group["params"] if p.grad is not None]
+        ).to(device)  # without any gradient it is made on the host
+        for index, group in enumerate(optimizer.param_groups)
+    }
+
+
+def check_trainer(trainer: L.Trainer) -> None:
+    """Refuses precisions and callbacks that the stages cannot train with."""
+    settings = cast(Any, trainer)
+    if settings.precision not in _PRECISIONS:
+        raise ValueError(
+            f"trainer.precision {settings.precision} is not supported, as weights, statistics and "
+            f"prepared scans are float32: give one of {', '.join(_PRECISIONS)}"
+        )
+    if settings.reload_dataloaders_every_n_epochs:
+        raise ValueError(
+            "trainer.reload_dataloaders_every_n_epochs would break the order of a resumed run: "
+            "leave it out; the loaders shuffle each epoch anew"
+        )
+    if any(isinstance(callback, StochasticWeightAveraging) for callback in settings.callbacks):
+        raise ValueError(
+            "StochasticWeightAveraging is not supported: leave the callback out; stages that train "
+            "a SiT keep an average of their own, see model.ema_decay"
+        )
+
+
+def check_latents(vae: VAE | ImageVAE, sit: VelocityNetwork, image_size: tuple[int, int]) -> None:
+    """Refuses a velocity network of other latents than the images have."""
+    if sit.in_channels != vae.latent_channels:
+        raise ValueError(
+            f"sit.in_channels is {sit.in_channels}, but the VAE has {vae.latent_channels} latent "
+            "channels; give both the same number"
+        )
+    latent_size = vae.latent_size(image_size)
+    if latent_size != tuple(sit.input_size):
+        raise ValueError(
+            f"images of {image_size} pixels give {latent_size} latents, but sit.input_size is "
+            f"{tuple(sit.input_size)}; set it to the former"
+        )

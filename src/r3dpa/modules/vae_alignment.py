@@ -15,7 +15,7 @@ from r3dpa.nn import VAE, PatchDiscriminator, VelocityNetwork
 class VAEAlignment(GenerativeModule):
     """VAE alignment: L_AE + lambda1 L_align through a frozen transformer.
 
-    Trained are the VAE, the discriminator, the projection head and the patch embedding; the
+    Trains the VAE, discriminator, projection head and patch embedding; the
     transformer's blocks keep their RGB-pretrained values. With ``weights.vae_alignment`` 0 this is
     the plain VAE of the ablations and the SiT takes no part. The latent statistics follow the VAE,
     so that the frozen blocks see unit variance and the joint stage starts from fitted statistics
@@ -29,8 +29,8 @@ class VAEAlignment(GenerativeModule):
         vae: Range-image autoencoder, trained from scratch.
         sit: Velocity network, frozen but for projector and input layer (patch embedding).
         discriminator: Patch discriminator; without it, no adversarial term.
-        train_encoder: False keeps the encoder, and with it the latents that a flow has learned,
-            while the decoder is trained on.
+        train_encoder: False freezes the encoder, so that an existing flow stays valid, and
+            fine-tunes the decoder.
         train_patch_embed: Train the patch embedding (paper); False freezes it (official code).
         keep_projector: Keep the RGB model's projection head where its shape fits, as officially.
         **kwargs: See :class:`GenerativeModule`.

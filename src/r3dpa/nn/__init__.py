@@ -1,5 +1,6 @@
 """Networks: range-image VAE, flow transformer, discriminator, latent statistics."""
 
+from r3dpa.nn.average_velocity import AverageVelocitySiT
 from r3dpa.nn.discriminator import PatchDiscriminator
 from r3dpa.nn.ema import EMA
 from r3dpa.nn.image_vae import ImageVAE
@@ -12,6 +13,7 @@ from r3dpa.nn.velocity_network import VelocityNetwork, VelocityOutput
 __all__ = [
     "EMA",
     "VAE",
+    "AverageVelocitySiT",
     "ImageVAE",
     "LatentNorm",
     "PatchDiscriminator",

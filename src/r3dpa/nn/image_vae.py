@@ -26,7 +26,7 @@ class ImageVAE(Autoencoder):
     factor 0.18215.
 
     Source: Rombach et al., "High-resolution image synthesis with latent diffusion models" (CVPR
-    2022). State-dict keys are those of ``AutoencoderKL`` in diffusers, whose safetensors files
+    2022). State-dict keys follow ``AutoencoderKL`` in diffusers, whose safetensors files
     :func:`r3dpa.checkpoints.read_checkpoint` reads.
 
     Args:

@@ -16,7 +16,7 @@ class LatentNorm(nn.Module):
 
     A batch norm without weights: :meth:`update` uses batch statistics (training), :meth:`normalise`
     running statistics; the mode of the module plays no part. Latents are ``(B, C, h, w)``; results
-    are in float32 or wider. State-dict keys are those of ``torch.nn.BatchNorm2d``.
+    are in float32 or wider. State-dict keys follow ``torch.nn.BatchNorm2d``.
 
     Source: the batch norm inside SiT of REPA-E (Leng et al. 2025) and R3DPA (ICRA 2026).
 
@@ -72,7 +72,7 @@ class LatentNorm(nn.Module):
     def update(self, latents: Tensor) -> Tensor:
         """Latents normalised with the statistics of this batch, which move the running ones.
 
-        The batch is that of all processes when ``torch.distributed`` is initialised; every process
+        The batch covers all processes when ``torch.distributed`` is initialised; every process
         must then call it, as gradients flow through the shared statistics. The biased variance
         normalises, the unbiased one enters the running statistics. A batch with a non-finite
         latent, or whose variance overflows, leaves mean, variance and count unchanged.

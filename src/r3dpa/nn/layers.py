@@ -1,4 +1,4 @@
-"""Layers that several networks share; in those of range images columns wrap around.
+"""Layers that several networks share; for range images, columns wrap around.
 
 Letters: B batch, C channels, H x W image or latent size, N tokens, D token width.
 """
@@ -86,7 +86,7 @@ class CircularConv2d(nn.Conv2d):
         return super().forward(image)
 
 
-class WideCircularConv2d(CircularConv2d):
+class Float32CircularConv2d(CircularConv2d):
     """:class:`CircularConv2d` in at least float32, also under autocast.
 
     For the layer that outputs a range image: in bfloat16 a range of 50 m would be off by 0.1 m.
@@ -220,9 +220,9 @@ class SelfAttention(nn.Module):
         self.k_norm = nn.LayerNorm(width // num_heads) if qk_norm else nn.Identity()
         self.proj = linear(width, width)
 
-    def forward(self, tokens: Tensor, mixed: bool = True) -> Tensor:
-        """``(B, N, D)`` to the same shape; with ``mixed`` False each token attends to itself."""
-        if not mixed:
+    def forward(self, tokens: Tensor, identity_attention: bool = False) -> Tensor:
+        """``(B, N, D)`` to the same shape; with identity attention each token sees itself alone."""
+        if identity_attention:
             return self.proj(self.qkv(tokens).chunk(3, dim=-1)[2])
         query, key, value = rearrange(
             self.qkv(tokens), "B N (three head d) -> three B head N d", three=3, head=self.num_heads

@@ -33,8 +33,8 @@ class PixelOutputs(NamedTuple):
 class RangeMixture:
     """Two Laplacians for the encoded range of each pixel, near and far at an edge.
 
-    Without a least scale the likelihood of a flat wall would have no limit. Errors smaller than it
-    count linearly instead of by their logarithm, so that large errors count more beside them.
+    Below the least scale the loss is linear instead of logarithmic, which keeps small errors from
+    dominating and bounds the likelihood of a flat wall.
 
     Source: Tosi et al., "SMD-Nets: stereo mixture density networks" (CVPR 2021).
 

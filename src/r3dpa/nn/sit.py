@@ -7,9 +7,8 @@ the latent batch norm is a network of its own (:class:`r3dpa.nn.latent_norm.Late
 
 from __future__ import annotations
 
-import copy
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Literal, Self
 
 import torch
@@ -29,8 +28,9 @@ from r3dpa.nn.layers import (
 from r3dpa.nn.velocity_network import (
     MAX_PERIOD,
     TIME_WIDTH,
+    Float32Linear,
     VelocityNetwork,
-    WideLinear,
+    VelocityOutput,
     time_frequencies,
 )
 
@@ -52,7 +52,6 @@ def sincos_position_embedding(
     rows, columns = grid_size
     exponents = torch.arange(width // 4, dtype=torch.float64) / (width // 4)
     frequencies = torch.exp(-math.log(MAX_PERIOD) * exponents)
-
     harmonics = 1.0 + torch.arange(width // 4, dtype=torch.float64) % max(1, columns // 2)
 
     def axis_code(positions: Tensor, frequencies: Tensor) -> Tensor:
@@ -95,11 +94,6 @@ class SiT(VelocityNetwork):
         periodic_columns: Let the position embedding wrap around with the scan.
         projector: ``mlp`` of three layers, or one ``conv`` over the grid of tokens (iREPA, Singh
             et al. 2025), which takes neither ``projector_dim`` nor official weights.
-        average_blocks: Number of last blocks with a second copy, which predicts average velocities,
-            see :meth:`average_velocity`; 0 for none.
-        guidance_block: Block that does without attention in :meth:`velocity_pair_at`, counted
-            from 1; 0 for none.
-        guidance_scale: Strength of that guidance for generated scenes, at least 1; 1 for none.
     """
 
     pos_embed: Tensor
@@ -122,9 +116,6 @@ class SiT(VelocityNetwork):
         learn_pos_embed: bool = False,
         periodic_columns: bool = False,
         projector: Literal["mlp", "conv"] = "mlp",
-        average_blocks: int = 0,
-        guidance_block: int = 0,
-        guidance_scale: float = 1.0,
     ) -> None:
         super().__init__()
         rows, columns = input_size
@@ -142,18 +133,6 @@ class SiT(VelocityNetwork):
             raise ValueError(
                 f"alignment_depth must lie in 1..depth = 1..{depth}, got {alignment_depth}"
             )
-        if not 0 <= average_blocks <= depth:
-            raise ValueError(
-                f"average_blocks must lie in 0..depth = 0..{depth}, got {average_blocks}"
-            )
-        if not 0 <= guidance_block <= depth or guidance_scale < 1:
-            raise ValueError(
-                f"guidance_block must lie in 0..depth = 0..{depth} and guidance_scale be at least "
-                f"1, got {guidance_block} and {guidance_scale}"
-            )
-        if guidance_scale != 1 and not guidance_block:
-            raise ValueError(f"guidance_scale {guidance_scale:g} needs a guidance_block")
-        self.guidance_block, self.guidance_scale = guidance_block, guidance_scale
         self.input_size = (rows, columns)
         self.in_channels = in_channels
         self.hidden_size = hidden_size
@@ -168,7 +147,7 @@ class SiT(VelocityNetwork):
         nn.init.zeros_(patches.get_parameter("bias"))
         to_tokens = Rearrange("B D row column -> B (row column) D")
         self.x_embedder = named_layers(proj=patches, tokens=to_tokens)
-        self.t_embedder = _TimeEmbedding(hidden_size)
+        self.t_embedder = TimeEmbedding(hidden_size)
         classes = nn.Embedding(num_classes + int(class_dropout), hidden_size)
         nn.init.normal_(classes.weight, std=_TABLE_STD)
         self.y_embedder = named_layers(embedding_table=classes)
@@ -178,7 +157,7 @@ class SiT(VelocityNetwork):
         else:
             self.register_buffer("pos_embed", position)
         self.blocks = nn.ModuleList(
-            _Block(hidden_size, num_heads, mlp_ratio, qk_norm) for _ in range(depth)
+            SiTBlock(hidden_size, num_heads, mlp_ratio, qk_norm) for _ in range(depth)
         )
         if projector == "mlp":
             self.projector = nn.Sequential(
@@ -195,32 +174,52 @@ class SiT(VelocityNetwork):
                 Rearrange("B F row column -> B (row column) F"),
             )
         self.final_layer = _FinalLayer(hidden_size, math.prod(patch) * in_channels)
-        self.average: _AverageHead | None = None
-        if average_blocks:
-            last = copy.deepcopy(self.blocks[depth - average_blocks :])
-            self.average = _AverageHead(hidden_size, last, copy.deepcopy(self.final_layer))
 
-    def velocity_pair_at(self, latents: Tensor, modulations: Tensor) -> tuple[Tensor, Tensor]:
-        """Velocities ``(B, C, h, w)``, as of :meth:`velocity_at` and without one attention map.
+    def forward(
+        self, latents: Tensor, time: Tensor, labels: Tensor | None = None
+    ) -> VelocityOutput:
+        """Velocity ``(B, C, h, w)`` and projected features ``(B, N, F)``, from one pass."""
+        self._check(latents, time)
+        modulations = self.modulations(time, labels)
+        tokens = self.embed(latents)
+        aligned = self.run_blocks(self.blocks[: self.alignment_depth], tokens, modulations)
+        later = self._later_modulations(modulations)
+        tokens = self.run_blocks(self.blocks[self.alignment_depth :], aligned, later)
+        velocity = self.output(self.final_layer, tokens, modulations)
+        return VelocityOutput(velocity, self.projector(aligned))
 
-        In block ``guidance_block`` of the second each token attends to itself alone. The blocks
-        before it are evaluated once, those behind it on both. A ``ValueError`` without the block.
+    def modulations(self, time: Tensor, labels: Tensor | None = None) -> Tensor:
+        """Shifts, scales and gates ``(T, M)``: six vectors per block, then two for the output."""
+        return modulations_of([*self.blocks, self.final_layer], self.conditioning(time, labels))
 
-        Source: perturbed-attention guidance (Ahn et al. 2024).
-        """
-        if not self.guidance_block:
-            raise ValueError("the network names no guidance_block, so there is no pair to guide by")
-        before, width = self.guidance_block - 1, 6 * self.hidden_size
-        tokens = self.x_embedder(latents) + self.pos_embed
-        tokens = self._through(self.blocks[:before], tokens, modulations)
-        rows = modulations[:, before * width : (before + 1) * width]
-        block, later = self.blocks[before], modulations[:, (before + 1) * width :]
-        both = torch.cat([block(tokens, rows), block(tokens, rows, mixed=False)])
-        if len(later) > 1:  # one row per sample
-            later = later.repeat(2, 1)
-        both = self._through(self.blocks[before + 1 :], both, later)
-        strong, weak = self._output(self.final_layer, both, later).chunk(2)
-        return strong, weak
+    def conditioning(self, time: Tensor, labels: Tensor | None) -> Tensor:
+        """Embedding ``(T, D)`` of times and classes, in the dtype of the modulation layers."""
+        labels = self._labels(time, labels)
+        conditioning = self.t_embedder(time) + self.y_embedder(labels)
+        return conditioning.to(self.final_layer.linear.weight.dtype)
+
+    def embed(self, latents: Tensor) -> Tensor:
+        """Tokens ``(B, N, D)`` of latents ``(B, C, h, w)``, with their positions."""
+        return self.x_embedder(latents) + self.pos_embed
+
+    def run_blocks(
+        self, blocks: Iterable[nn.Module], tokens: Tensor, modulations: Tensor
+    ) -> Tensor:
+        """Tokens ``(B, N, D)`` after some blocks, whose modulations come first in ``(B, M)``."""
+        width = 6 * self.hidden_size
+        for index, block in enumerate(blocks):
+            tokens = block(tokens, modulations[:, index * width : (index + 1) * width])
+        return tokens
+
+    def output(self, layer: nn.Module, tokens: Tensor, modulations: Tensor) -> Tensor:
+        """Velocity ``(B, C, h, w)`` of an output layer, whose modulations come last."""
+        return rearrange(
+            layer(tokens, modulations[:, -2 * self.hidden_size :]),
+            "B (row column) (p q C) -> B C (row p) (column q)",
+            row=self.grid_size[0],
+            p=self.patch[0],
+            q=self.patch[1],
+        )
 
     @property
     def input_layer(self) -> nn.Module:
@@ -230,125 +229,45 @@ class SiT(VelocityNetwork):
     @property
     def compiled_parts(self) -> list[nn.Module]:
         """The blocks, which share a graph."""
-        return [*self.blocks, *([] if self.average is None else self.average.blocks)]
+        return list(self.blocks)
 
-    def modulations(
-        self, time: Tensor, labels: Tensor | None = None, target: Tensor | None = None
-    ) -> Tensor:
-        """Shifts, scales and gates ``(T, M)``: six vectors per block, then two for the output.
-
-        With target times ``(T,)`` they are those of :meth:`average_velocity_at`.
-        """
-        conditioning = self._conditioning(time, labels)
-        if target is None:
-            return _rows([*self.blocks, self.final_layer], conditioning)
-        head = self._average_head()
-        late = conditioning + head.embedder(time - target).to(conditioning.dtype)
-        shared = self.blocks[: -len(head.blocks)]
-        return torch.cat(
-            [
-                _rows(layers, c)
-                for layers, c in ((shared, conditioning), (head.layers, late))
-                if layers
-            ],
-            dim=1,
-        )
-
-    def average_velocity(
-        self, latents: Tensor, time: Tensor, target: Tensor, labels: Tensor | None = None
-    ) -> Tensor:
-        """Mean ``(B, C, h, w)`` of the velocity along the path from ``time`` to ``target``.
-
-        ``(x_t - x_r) / (t - r)`` of the points at ``time`` t and ``target`` r, both ``(B,)``. The
-        first blocks are those of :meth:`velocity`; a copy of the others is also modulated by
-        ``t - r``, by weights that start at 0: it equals :meth:`velocity` bit for bit then.
-
-        Source: MeanFlow (Geng et al. 2025); layout of Decoupled MeanFlow (Lee et al. 2025).
-        """
-        self._check(latents, time)
-        return self.average_velocity_at(latents, self.modulations(time, labels, target))
-
-    def average_velocity_at(self, latents: Tensor, modulations: Tensor) -> Tensor:
-        """Average velocity ``(B, C, h, w)`` from precomputed modulations of both times."""
-        head = self._average_head()
-        blocks = [*self.blocks[: -len(head.blocks)], *head.blocks]
-        tokens = self._through(blocks, self.x_embedder(latents) + self.pos_embed, modulations)
-        return self._output(head.final_layer, tokens, modulations)
-
-    def with_average(self, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Weights of a network without ``average_blocks``, completed to those of this one."""
-        head, own = self._average_head(), self.state_dict()
-        first = len(self.blocks) - len(head.blocks)
-        added = {key: own[key] for key in own if key.startswith("average.embedder.")}
-        for key, value in weights.items():
-            kind, _, rest = key.partition(".")
-            index, _, name = rest.partition(".")
-            if kind == "final_layer":
-                added[f"average.{key}"] = value
-            elif kind == "blocks" and int(index) >= first:
-                added[f"average.blocks.{int(index) - first}.{name}"] = value
-        return {**weights, **added}
-
-    def _average_head(self) -> _AverageHead:
-        if self.average is None:
-            raise ValueError(
-                "the network predicts no average velocities (average_blocks 0): take a checkpoint "
-                "of stage few_step, or another solver than average_velocity"
-            )
-        return self.average
-
-    def halve_(self) -> Self:
+    def to_bfloat16_(self) -> Self:
         """Casts the weights of attention and MLPs to bfloat16 in place, for sampling.
 
         Time embedding, modulations, the token stream between the blocks, statistics of the norms
         and the output layer stay float32.
         """
         for block in self.compiled_parts:
-            block.attn.bfloat16()
-            block.mlp.bfloat16()
+            block.get_submodule("attn").bfloat16()
+            block.get_submodule("mlp").bfloat16()
         return self
 
-    def _conditioning(self, time: Tensor, labels: Tensor | None) -> Tensor:
-        """Embedding ``(T, D)`` in the dtype of the modulation layers."""
-        labels = self._labels(time, labels)
-        conditioning = self.t_embedder(time) + self.y_embedder(labels)
-        return conditioning.to(self.final_layer.linear.weight.dtype)
-
-    def _first_modulations(self, time: Tensor, labels: Tensor | None) -> Tensor:
-        return _rows(self.blocks[: self.alignment_depth], self._conditioning(time, labels))
+    # Parts of the forward pass, for evaluations that need only one of its results
 
     def _begin(self, latents: Tensor, modulations: Tensor) -> tuple[Tensor, ...]:
-        """Tokens ``(B, N, D)`` after block ``alignment_depth``."""
-        tokens = self.x_embedder(latents) + self.pos_embed
-        return (self._through(self.blocks[: self.alignment_depth], tokens, modulations),)
+        first = self.blocks[: self.alignment_depth]
+        return (self.run_blocks(first, self.embed(latents), modulations),)
 
     def _project(self, activations: Tensor) -> Tensor:
         return self.projector(activations)
 
     def _finish(self, activations: tuple[Tensor, ...], modulations: Tensor) -> Tensor:
         (tokens,) = activations
-        width = 6 * self.hidden_size * self.alignment_depth
-        later = self.blocks[self.alignment_depth :]
-        tokens = self._through(later, tokens, modulations[:, width:])
-        return self._output(self.final_layer, tokens, modulations)
+        later = self._later_modulations(modulations)
+        tokens = self.run_blocks(self.blocks[self.alignment_depth :], tokens, later)
+        return self.output(self.final_layer, tokens, modulations)
 
-    def _output(self, layer: nn.Module, tokens: Tensor, modulations: Tensor) -> Tensor:
-        return rearrange(
-            layer(tokens, modulations[:, -2 * self.hidden_size :]),
-            "B (row column) (p q C) -> B C (row p) (column q)",
-            row=self.grid_size[0],
-            p=self.patch[0],
-            q=self.patch[1],
-        )
+    def _first_modulations(self, time: Tensor, labels: Tensor | None) -> Tensor:
+        first = self.blocks[: self.alignment_depth]
+        return modulations_of(first, self.conditioning(time, labels))
 
-    def _through(self, blocks: Iterable[nn.Module], tokens: Tensor, modulations: Tensor) -> Tensor:
-        width = 6 * self.hidden_size
-        for index, block in enumerate(blocks):
-            tokens = block(tokens, modulations[:, index * width : (index + 1) * width])
-        return tokens
+    def _later_modulations(self, modulations: Tensor) -> Tensor:
+        """Modulations of the layers behind the aligned depth."""
+        return modulations[:, 6 * self.hidden_size * self.alignment_depth :]
 
 
-def _rows(layers: Iterable[nn.Module], conditioning: Tensor) -> Tensor:
+def modulations_of(layers: Iterable[nn.Module], conditioning: Tensor) -> Tensor:
+    """Modulations ``(T, M)`` of layers, next to each other, by the embedding ``(T, D)``."""
     rows = [layer.get_submodule("adaLN_modulation")(conditioning) for layer in layers]
     return torch.cat(rows, dim=1)
 
@@ -360,16 +279,20 @@ def _xavier_linear(in_features: int, out_features: int) -> nn.Linear:
     return layer
 
 
-class _TimeEmbedding(nn.Module):
+class TimeEmbedding(nn.Module):
+    """Embedding ``(T, D)`` of times ``(T,)``, in at least float32."""
+
     def __init__(self, hidden_size: int) -> None:
         super().__init__()
-        first, second = WideLinear(TIME_WIDTH, hidden_size), WideLinear(hidden_size, hidden_size)
+        first = Float32Linear(TIME_WIDTH, hidden_size)
+        second = Float32Linear(hidden_size, hidden_size)
         for layer in (first, second):
             nn.init.normal_(layer.weight, std=_TABLE_STD)
             nn.init.zeros_(layer.bias)
         self.mlp = nn.Sequential(first, nn.SiLU(), second)
 
     def forward(self, time: Tensor) -> Tensor:
+        """Embedding of times ``(T,)``."""
         return self.mlp(time_frequencies(at_least_float32(time)))
 
 
@@ -386,39 +309,31 @@ def _modulated_norm(tokens: Tensor, shift: Tensor, scale: Tensor) -> Tensor:
     return normalised * (1 + scale[:, None]) + shift[:, None]
 
 
-class _Block(nn.Module):
+class SiTBlock(nn.Module):
+    """Attention and MLP, each modulated before and gated after (adaLN-zero)."""
+
     def __init__(self, hidden_size: int, num_heads: int, mlp_ratio: float, qk_norm: bool) -> None:
         super().__init__()
         self.attn = SelfAttention(hidden_size, num_heads, qk_norm, _xavier_linear)
         self.mlp = Mlp(hidden_size, int(hidden_size * mlp_ratio), _xavier_linear, "tanh")
         self.adaLN_modulation = _modulation(hidden_size, 6)
 
-    def forward(self, tokens: Tensor, modulation: Tensor, mixed: bool = True) -> Tensor:
-        """Tokens ``(B, N, D)`` after the block; ``(B, 6 D)`` or, for all samples, ``(1, 6 D)``.
+    def forward(
+        self, tokens: Tensor, modulation: Tensor, identity_attention: bool = False
+    ) -> Tensor:
+        """Tokens ``(B, N, D)`` after the block.
 
-        With ``mixed`` False each token attends to itself alone.
+        Args:
+            tokens: ``(B, N, D)``.
+            modulation: ``(B, 6 D)`` or, for all samples, ``(1, 6 D)``.
+            identity_attention: Let each token attend to itself alone.
         """
         shift_attn, scale_attn, gate_attn, shift_mlp, scale_mlp, gate_mlp = modulation.chunk(6, 1)
-        narrow = self.mlp.fc1.weight.dtype  # bfloat16 after SiT.halve_
-        attended = self.attn(_modulated_norm(tokens, shift_attn, scale_attn).to(narrow), mixed)
-        tokens = tokens + gate_attn[:, None] * attended
-        hidden = self.mlp(_modulated_norm(tokens, shift_mlp, scale_mlp).to(narrow))
-        return tokens + gate_mlp[:, None] * hidden
-
-
-class _AverageHead(nn.Module):
-    """Embedding of the length of a step, and copies of the last blocks and the output layer."""
-
-    def __init__(self, hidden_size: int, blocks: nn.ModuleList, final_layer: nn.Module) -> None:
-        super().__init__()
-        self.embedder = _TimeEmbedding(hidden_size)
-        zeroed(self.embedder.mlp[2])
-        self.blocks, self.final_layer = blocks, final_layer
-
-    @property
-    def layers(self) -> list[nn.Module]:
-        """All layers that are modulated."""
-        return [*self.blocks, self.final_layer]
+        dtype = self.mlp.fc1.weight.dtype  # bfloat16 after SiT.to_bfloat16_
+        normed = _modulated_norm(tokens, shift_attn, scale_attn).to(dtype)
+        tokens = tokens + gate_attn[:, None] * self.attn(normed, identity_attention)
+        normed = _modulated_norm(tokens, shift_mlp, scale_mlp).to(dtype)
+        return tokens + gate_mlp[:, None] * self.mlp(normed)
 
 
 class _FinalLayer(nn.Module):

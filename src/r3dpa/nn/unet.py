@@ -18,13 +18,13 @@ from torch import Tensor, nn
 
 from r3dpa.nn.layers import (
     CircularConv2d,
+    Float32CircularConv2d,
     GroupNorm,
-    WideCircularConv2d,
     at_least_float32,
     named_layers,
     zeroed,
 )
-from r3dpa.nn.velocity_network import VelocityNetwork, WideLinear, time_frequencies
+from r3dpa.nn.velocity_network import Float32Linear, VelocityNetwork, time_frequencies
 
 _KERNEL = (3, 3)
 _NORM_EPS = 1e-5  # the VAE of the same authors has 1e-6
@@ -96,7 +96,7 @@ class UNet(VelocityNetwork):
         widths = [channels * multiplier for multiplier in channel_multipliers]
         embedding = 4 * channels
         self.time_embed = nn.Sequential(
-            WideLinear(channels, embedding), nn.SiLU(), WideLinear(embedding, embedding)
+            Float32Linear(channels, embedding), nn.SiLU(), Float32Linear(embedding, embedding)
         )
         self.label_emb = nn.Embedding(num_classes, embedding)
 
@@ -139,7 +139,7 @@ class UNet(VelocityNetwork):
                     layers.append(named_layers(up=nn.Upsample(scale_factor=2), conv=doubled))
                 self.output_blocks.append(_Layers(*layers))
         self.out = nn.Sequential(
-            _norm(width), nn.SiLU(), zeroed(WideCircularConv2d(width, in_channels, _KERNEL))
+            _norm(width), nn.SiLU(), zeroed(Float32CircularConv2d(width, in_channels, _KERNEL))
         )
 
     @property
@@ -158,7 +158,7 @@ class UNet(VelocityNetwork):
         frequencies = time_frequencies(at_least_float32(time), self.channels)
         return self.time_embed(frequencies) + self.label_emb(labels)
 
-    def halve_(self) -> Self:
+    def to_bfloat16_(self) -> Self:
         """Casts all convolutions between the first and the last to bfloat16, for sampling.
 
         Time embedding, statistics of the norms, the first layer with the position bias and the
@@ -172,7 +172,7 @@ class UNet(VelocityNetwork):
 
     def _begin(self, latents: Tensor, modulations: Tensor) -> tuple[Tensor, ...]:
         hidden = self.ape(self.input_layer(latents, modulations))
-        narrow = self.middle_block.get_parameter("0.in_layers.2.weight").dtype  # after halve_
+        narrow = self.middle_block.get_parameter("0.in_layers.2.weight").dtype  # after to_bfloat16_
         kept = [hidden.to(narrow)]
         for block in self.input_blocks[1:]:
             kept.append(block(kept[-1], modulations))

@@ -18,10 +18,10 @@ from torch import Tensor, nn
 from r3dpa.nn.layers import (
     AttentionBlock,
     CircularConv2d,
+    Float32CircularConv2d,
     GroupNorm,
     ResBlock,
     Upsample,
-    WideCircularConv2d,
     at_least_float32,
     downsample,
     zeroed,
@@ -120,7 +120,7 @@ class Autoencoder(nn.Module):
         return Posterior(self.quant_conv(self.encoder(image)))
 
     def predict(self, latents: Tensor) -> Tensor:
-        """Outputs of the decoder, those that the reconstruction loss is computed of."""
+        """Outputs of the decoder, from which the reconstruction loss is computed."""
         return self.decoder(self.post_quant_conv(latents))
 
     def image_of(self, prediction: Tensor) -> Tensor:
@@ -160,14 +160,14 @@ class VAE(Autoencoder):
 
     ``intensity`` and ``num_classes`` add channels to such images: the encoder takes the class as
     one channel for each, the decoder predicts their logits. They enter and leave through layers of
-    their own, whose kernels are 1 x 1 to save time. That of the encoder starts at 0: with the other
-    weights of a VAE without these channels, this one has its latents.
+    their own, whose kernels are 1 x 1 to save time. The one of the encoder starts at 0: with the
+    other weights of a VAE without these channels, this one has its latents.
 
     Source: Ran et al., "Towards realistic scene generation with LiDAR diffusion models" (CVPR
-    2024); R3DPA (ICRA 2026) uses h2p4d8. State-dict keys are those of the official checkpoints.
+    2024); R3DPA (ICRA 2026) uses h2p4d8. State-dict keys follow the official checkpoints.
 
     Args:
-        in_channels: Channels of the range image, without those of intensity and class.
+        in_channels: Channels of the range image, without intensity and class.
         latent_channels: Channels C of the latents.
         channels: Base width, a multiple of 32.
         channel_multipliers: Width of each level in units of the base width.
@@ -286,7 +286,7 @@ class VAE(Autoencoder):
         return torch.cat([image, *further], dim=1) if further else image
 
     def scan_of(self, prediction: Tensor) -> Tensor:
-        """Images ``(B, in_channels, H, W)`` of outputs, as a discriminator sees those of scans.
+        """Images ``(B, in_channels, H, W)`` of outputs, as a discriminator sees scans.
 
         They are without intensity and class. Where the second channel is the logit of a return, it
         becomes 1 or -1, and the range -1 without one: the logit would give every reconstruction
@@ -300,13 +300,13 @@ class VAE(Autoencoder):
         seen = (logit > 0).to(soft) + soft - soft.detach()
         return torch.cat([seen * (image[:, :1] + 1) - 1, 2 * seen - 1], dim=1)
 
-    def halve_decoder_(self) -> Self:
+    def decoder_to_bfloat16_(self) -> Self:
         """Casts the convolutions of the decoder, but for the outputs, to bfloat16 for sampling.
 
         Statistics of the norms and the result of :meth:`decode` stay float32.
         """
         for layer in self.decoder.modules():
-            if isinstance(layer, nn.Conv2d) and not isinstance(layer, WideCircularConv2d):
+            if isinstance(layer, nn.Conv2d) and not isinstance(layer, Float32CircularConv2d):
                 layer.bfloat16()
         return self
 
@@ -398,10 +398,10 @@ class _Decoder(nn.Module):
         )
         self.norm_out = GroupNorm(first)
         kernel = (1, 4) if by_pixel else (3, 3)
-        self.conv_out = WideCircularConv2d(first, out_channels * math.prod(stem), kernel)
+        self.conv_out = Float32CircularConv2d(first, out_channels * math.prod(stem), kernel)
         self.further_out: nn.Module | None = None
         if further:
-            self.further_out = WideCircularConv2d(first, further * math.prod(stem), (1, 1))
+            self.further_out = Float32CircularConv2d(first, further * math.prod(stem), (1, 1))
 
     def forward(self, latents: Tensor) -> Tensor:
         hidden = self.mid(self.conv_in(latents.to(self.conv_in.weight.dtype)))
@@ -419,7 +419,7 @@ class _Decoder(nn.Module):
 
 
 class _Level(nn.Module):
-    """Residual blocks, each followed by attention if asked for, and a resampling layer."""
+    """Residual blocks, optionally each followed by attention, and a resampling layer."""
 
     def __init__(
         self,

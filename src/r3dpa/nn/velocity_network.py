@@ -38,7 +38,7 @@ class VelocityNetwork(nn.Module, ABC):
 
     Arguments of all evaluations: ``latents`` ``(B, C, h, w)`` noisy normalised latents, ``time``
     ``(B,)`` flow times (0 data, 1 noise), ``labels`` ``(B,)`` int64 classes, which a one-class
-    model does not need. Wrong latents or times, or missing labels, are a ``ValueError``.
+    model does not need. Wrong latents or times, or missing labels, raise a ValueError.
 
     Attributes:
         input_size: Latent rows and columns ``(h, w)``.
@@ -47,8 +47,6 @@ class VelocityNetwork(nn.Module, ABC):
         feature_dim: Width F of the features.
         num_classes: Number of classes.
         projector: Head of the features.
-        guidance_block: Block that :meth:`SiT.velocity_pair_at` changes; 0 in other networks.
-        guidance_scale: Default strength of the guidance by that pair; 1 for none.
     """
 
     input_size: tuple[int, int]
@@ -57,8 +55,6 @@ class VelocityNetwork(nn.Module, ABC):
     feature_dim: int
     num_classes: int
     projector: nn.Sequential
-    guidance_block: int = 0
-    guidance_scale: float = 1.0
 
     def forward(
         self, latents: Tensor, time: Tensor, labels: Tensor | None = None
@@ -126,7 +122,7 @@ class VelocityNetwork(nn.Module, ABC):
         """Modulation vectors ``(T, M)`` of times ``(T,)`` and classes ``(T,)``."""
 
     @abstractmethod
-    def halve_(self) -> Self:
+    def to_bfloat16_(self) -> Self:
         """Casts the weights of nearly all of the computation to bfloat16 in place.
 
         For sampling without autocast. The velocity stays float32, and so does the time embedding:
@@ -180,7 +176,7 @@ def time_frequencies(time: Tensor, width: int = TIME_WIDTH) -> Tensor:
     return torch.cat([angles.cos(), angles.sin()], dim=1)
 
 
-class WideLinear(nn.Linear):
+class Float32Linear(nn.Linear):
     """Linear layer in at least float32, also under autocast."""
 
     def forward(self, inputs: Tensor) -> Tensor:

@@ -61,7 +61,7 @@ def told(benchmark, theirs, ours):
 def bench_sampler(benchmark, code, networks, kind, one_thread):
     nets, samplers = sits(code, networks), code["samplers"]
     half = networks.network("ema").build().eval()
-    half.halve_()
+    half.to_bfloat16_()
     noise = torch.randn(4, nets.ours.in_channels, *nets.ours.input_size)
     draws = torch.randn(STEPS - 1, *noise.shape, dtype=torch.float64)
     labels = torch.zeros(4, dtype=torch.long)
@@ -89,7 +89,7 @@ def bench_sampler(benchmark, code, networks, kind, one_thread):
 def bench_decode(benchmark, code, one_thread):
     networks = random_networks(SIT, {})
     nets, half = vaes(code, networks), networks.network("vae").build().eval()
-    half.halve_decoder_()
+    half.decoder_to_bfloat16_()
     latents = torch.randn(1, 8, 16, 128)
     with torch.inference_mode():
         assert relative(nets.ours.decode(latents), nets.theirs.decode(latents).sample) < 1e-4

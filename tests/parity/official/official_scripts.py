@@ -30,7 +30,7 @@ from torch.utils.data import DataLoader
 
 from r3dpa.checkpoints import Checkpoint, to_official
 from r3dpa.modules import JointAlignment
-from r3dpa.modules.steps import PathDraws
+from r3dpa.modules.stage import PathDraws
 
 _MODEL, _VAE = "r3dpa/2", "h2p4d8"
 _STRIDE = (4, 8)
