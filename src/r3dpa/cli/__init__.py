@@ -10,7 +10,7 @@ __all__ = ["COMMANDS", "main"]
 
 
 class Command(NamedTuple):
-    """Function ``file:name`` below ``r3dpa.cli``, or of another area, and summary for the help.
+    """Function ``file:name`` below ``r3dpa.cli``, or of another module, and summary for the help.
 
     jsonargparse reads the function: its arguments are the options, its docstring is the help, and
     what it returns is printed. Those of :data:`OWN_PARSER` take the words of the command line. A
@@ -23,10 +23,10 @@ class Command(NamedTuple):
 
 
 COMMANDS = {
-    "fit": Command("stages:run", "train a stage: r3dpa fit joint --preset demo"),
-    "validate": Command("stages:run", "evaluate on the validation split"),
-    "test": Command("stages:run", "sample scenes and compare them with real scans"),
-    "predict": Command("stages:run", "reconstruct scans with a checkpoint"),
+    "fit": Command("presets:run", "train a stage: r3dpa fit joint --preset demo"),
+    "validate": Command("presets:run", "evaluate on the validation split"),
+    "test": Command("presets:run", "sample scenes and compare them with real scans"),
+    "predict": Command("presets:run", "reconstruct scans with a checkpoint"),
     "data simulate": Command("lidarsim:simulate", "write simulated scans", True),
     "data check": Command("data:check", "list bad scans and missing folders of a data set"),
     "data convert": Command("lidarsim.conversion:convert", "write scans in another format"),
@@ -34,8 +34,8 @@ COMMANDS = {
     "data features": Command("features:features", "write feature grids of scans", resumable=True),
     "data objects": Command("data:objects", "write mean features of object classes for inpaint"),
     "data reference": Command("evaluate:reference", "write statistics of real scans", True),
-    "data weather": Command("weather:weather", "put your scans into fog, rain, snow, sun", True),
-    "data corrupt": Command("weather:corrupt", "give your scans faults of the sensor", True),
+    "data weather": Command("weather:weather", "simulate weather on recorded scans", True),
+    "data corrupt": Command("weather:corrupt", "add sensor faults to recorded scans", True),
     "data realism": Command("evaluate:realism", "compare simulated scans with real ones"),
     "sample": Command("sample:sample", "generate scenes from a checkpoint", resumable=True),
     "gallery": Command("gallery:gallery", "write a page of scenes, nearest scans and edits"),
@@ -53,7 +53,7 @@ COMMANDS = {
     "bench sampling": Command("bench:sampling", "measure accuracy against sampling time", True),
     "bench training": Command("bench:training", "measure time and memory of training steps"),
 }
-OWN_PARSER = ("stages:run", "features:features")
+OWN_PARSER = ("presets:run", "features:features")
 # Commands of `data` and `edit` are known by their own name, too: `r3dpa view` is `r3dpa data view`.
 _ALIASES = {name.split()[1]: name for name in COMMANDS if name.startswith(("data ", "edit "))}
 _GROUPS = tuple(dict.fromkeys(name.split()[0] for name in COMMANDS if " " in name))
@@ -74,7 +74,11 @@ def _find(args: list[str]) -> tuple[str, list[str]]:
     rest = args[len(name.split()) :]
     name = name if name in COMMANDS else _ALIASES.get(name, name)
     if name not in COMMANDS:
-        sys.stderr.write(f"r3dpa: unknown command {name!r}: give one of {', '.join(COMMANDS)}\n")
+        from r3dpa.cli.messages import suggestion
+
+        near = suggestion(name, [*COMMANDS, *_ALIASES])
+        hint = near or f"; choose from {', '.join(COMMANDS)}"
+        sys.stderr.write(f"r3dpa: unknown command '{name}'{hint}\n")
         sys.exit(2)
     return name, rest
 
@@ -113,7 +117,7 @@ def _run(args: list[str]) -> None:
 
 
 def main(args: list[str] | None = None) -> None:
-    """Runs the command line.
+    """Run the command line.
 
     Args:
         args: Words after ``r3dpa``. Default: those of the process, with errors about files or

@@ -11,7 +11,7 @@ from typing import Any, cast
 
 from lightning import Trainer
 
-from r3dpa.cli.stages import StageParser, ignore_harmless_warnings
+from r3dpa.cli.stages import StageParser, ignore_harmless_notices
 from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.data.feature_grids import features_lock, plan
 from r3dpa.data.scans import Scan
@@ -23,7 +23,7 @@ from r3dpa.modules.feature_extraction import FeatureExtraction
 
 def features(args: list[str]) -> None:
     """Runs the command with its name and the words after it."""
-    ignore_harmless_warnings()
+    ignore_harmless_notices()
     parser = features_parser("r3dpa data features")
     config = parser.parse_args(with_data_class(args[1:]))
     if config.extractor or config.ckpt:
@@ -37,7 +37,7 @@ def features(args: list[str]) -> None:
     if data.extractor is None or data.features_dir is None:
         raise ValueError(
             f"there is no extractor: give --extractor, one of {', '.join(SOURCES)}, or one in the "
-            "data configuration (data.init_args.extractor)"
+            "data configuration (--data.init_args.extractor)"
         )
     _extract(data, trainer, config.grid_sizes or [data.grid_size])
 

@@ -213,7 +213,7 @@ class LidarDataModule(LoaderModule):
         if self.weather_prior is not None:
             raise ValueError(
                 "weather: cached posteriors are those of the clear scans. Switch it off, or encode "
-                "in each step: model.init_args.cache_latents: false"
+                "in each step: --model.init_args.cache_latents false"
             )
         self.train_set = replace(self.train_set, posteriors=posteriors)
 
@@ -362,7 +362,7 @@ class PointDataModule(LoaderModule):
         super().__init__(batch_size, num_workers, seed)
         if source.extractor is not None:
             raise ValueError(
-                "data.init_args.source.init_args.extractor must be null: a network on points is "
+                "--data.init_args.source.init_args.extractor must be null: a network on points is "
                 "trained without feature grids."
             )
         self.source, self.prepare, self.weather_prior = source, prepare, weather

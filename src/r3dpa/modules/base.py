@@ -96,7 +96,7 @@ class GenerativeModule(ScanStage):
         compile: bool = False,
     ) -> None:
         if not 0 <= latent_noise <= 1:
-            raise ValueError(f"model.latent_noise must lie in [0, 1], got {latent_noise}")
+            raise ValueError(f"latent_noise must lie in [0, 1], got {latent_noise}")
         super().__init__(optimizer, seed, time_sampling)
         with steps.networks_as_settings():
             self.save_hyperparameters()
@@ -143,8 +143,8 @@ class GenerativeModule(ScanStage):
         sensor = geometry.projection.sensor
         if geometry.codec.reflectance:
             raise ValueError(
-                f"stage {self.stage} has no use for the reflectance of data.codec, which the "
-                "baselines generate: set codec.reflectance to false"
+                f"stage {self.stage} has no use for the reflectance of the images, which the "
+                "baselines generate: set --data.init_args.codec.reflectance to false"
             )
         check_image(self.vae, geometry.codec)
         check_latents(self.vae, self.sit, (sensor.beams, sensor.columns))
@@ -169,8 +169,8 @@ class GenerativeModule(ScanStage):
         if self.rgb_weights is not None:
             if not isinstance(self.sit, SiT):
                 raise ValueError(
-                    f"rgb_weights start a SiT, but model.sit is a {type(self.sit).__name__}; "
-                    "leave rgb_weights out"
+                    "--model.init_args.rgb_weights start a SiT, but the network is a "
+                    f"{type(self.sit).__name__}: leave them out"
                 )
             rgb = read_checkpoint(self.rgb_weights)
             found = transfer_rgb(rgb, self.sit, self.latent_norm, self.keep_projector)

@@ -16,18 +16,18 @@ def check_trainer(trainer: Any) -> None:
     """Refuses precisions and callbacks that the stages cannot train with."""
     if trainer.precision not in _PRECISIONS:
         raise ValueError(
-            f"trainer.precision {trainer.precision} is not supported, as weights, statistics and "
+            f"--trainer.precision {trainer.precision} is not supported, as weights, statistics and "
             f"prepared scans are float32: give one of {', '.join(_PRECISIONS)}"
         )
     if trainer.reload_dataloaders_every_n_epochs:
         raise ValueError(
-            "trainer.reload_dataloaders_every_n_epochs would break the order of a resumed run: "
+            "--trainer.reload_dataloaders_every_n_epochs would break the order of a resumed run: "
             "leave it out; the loaders shuffle each epoch anew"
         )
     if any(isinstance(callback, StochasticWeightAveraging) for callback in trainer.callbacks):
         raise ValueError(
             "StochasticWeightAveraging is not supported: leave the callback out; stages that train "
-            "a SiT keep an average of their own, see model.ema_decay"
+            "a SiT keep an average of their own, see --model.init_args.ema_decay"
         )
 
 
@@ -36,7 +36,7 @@ def geometry_of(datamodule: object, module: object) -> ScanGeometry:
     geometry = getattr(datamodule, "geometry", None)
     if not isinstance(geometry, ScanGeometry):
         raise ValueError(
-            f"data.class_path: {type(module).__name__} needs a data module that gives "
+            f"--data.class_path: {type(module).__name__} needs a data module that gives "
             "r3dpa.data.LidarBatch batches and has a geometry (r3dpa.geometry.ScanGeometry), such "
             f"as r3dpa.data.LidarDataModule, got {type(datamodule).__name__}"
         )
@@ -53,8 +53,9 @@ def check_image(vae: VAE, codec: RangeCodec) -> None:
             ", ".join(f"{n} {v}" for n, v in zip(names, vs, strict=True)) for vs in (own, theirs)
         )
         raise ValueError(
-            "model.vae is one of images with {}, but data.codec gives {}: set in_channels, "
-            "intensity and num_classes of the former to the latter".format(*given)
+            "the VAE is one of images with {}, but --data.init_args.codec gives {}: set "
+            "in_channels, intensity and num_classes of --model.init_args.vae to the "
+            "latter".format(*given)
         )
 
 
@@ -62,14 +63,16 @@ def check_latents(vae: VAE | ImageVAE, sit: VelocityNetwork, image_size: tuple[i
     """Refuses a velocity network of other latents than those of the images."""
     if sit.in_channels != vae.latent_channels:
         raise ValueError(
-            f"sit.in_channels is {sit.in_channels}, but the VAE has {vae.latent_channels} latent "
-            "channels; give both the same number"
+            f"the {type(sit).__name__} has in_channels {sit.in_channels}, but the VAE has "
+            f"{vae.latent_channels} latent channels; set "
+            "--model.init_args.sit.init_args.in_channels to the latter"
         )
     latent_size = vae.latent_size(image_size)
     if latent_size != tuple(sit.input_size):
         raise ValueError(
-            f"images of {image_size} pixels give {latent_size} latents, but sit.input_size is "
-            f"{tuple(sit.input_size)}; set it to the former"
+            f"images of {image_size} pixels give {latent_size} latents, but the "
+            f"{type(sit).__name__} has input_size {tuple(sit.input_size)}; set "
+            "--model.init_args.sit.init_args.input_size to the former"
         )
 
 
@@ -85,13 +88,13 @@ def check_features(
     if tuple(geometry.grid_size) != tuple(sit.grid_size):
         raise ValueError(
             f"feature grids are {geometry.grid_size}, but the {type(sit).__name__} has "
-            f"{tuple(sit.grid_size)} tokens; set data.grid_size to the latter"
+            f"{tuple(sit.grid_size)} tokens; set --data.init_args.grid_size to the latter"
         )
     feature_dim = getattr(datamodule, "feature_dim", sit.feature_dim)
     if feature_dim != sit.feature_dim:
         raise ValueError(
-            f"features have width {feature_dim}, but sit.feature_dim is {sit.feature_dim}; set it "
-            "to the former"
+            f"features have width {feature_dim}, but the {type(sit).__name__} has feature_dim "
+            f"{sit.feature_dim}; set --model.init_args.sit.init_args.feature_dim to the former"
         )
 
 

@@ -88,10 +88,10 @@ class FewStep(FlowMatching):
         if sit.average is None:
             raise ValueError(
                 "stage few_step trains a copy of the last blocks of the SiT: set "
-                "model.sit.init_args.average_blocks, to a third of its depth as a rule"
+                "--model.init_args.sit.init_args.average_blocks, to a third of its depth as a rule"
             )
         if trajectories < 1:
-            raise ValueError(f"model.trajectories must be at least 1, got {trajectories}")
+            raise ValueError(f"trajectories must be at least 1, got {trajectories}")
         super().__init__(vae, sit, **kwargs)
         if thin_decoder is not None:
             for name in (
@@ -100,9 +100,7 @@ class FewStep(FlowMatching):
             ):
                 theirs, own = getattr(vae, name), getattr(thin_decoder, name)
                 if theirs != own:
-                    raise ValueError(
-                        f"model.thin_decoder: {name} is {own}, but {theirs} of the VAE"
-                    )
+                    raise ValueError(f"thin_decoder: {name} is {own}, but {theirs} of the VAE")
         self.thin_decoder, self.trajectories = thin_decoder, trajectories
         self.time_sampling: TimeSampling = "uniform"
         self.sit.requires_grad_(False)
@@ -113,7 +111,8 @@ class FewStep(FlowMatching):
         """The averaged flow as the networks of this stage, its last blocks copied."""
         if before.interpolant != self.interpolant.path:
             raise ValueError(
-                f"{before.path} was trained on the {before.interpolant} path: set model.path to it"
+                f"{before.path} was trained on the {before.interpolant} path: set "
+                "--model.init_args.path to it"
             )
         before = super().previous_networks(before)
         flow = before.network("ema")

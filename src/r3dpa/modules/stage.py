@@ -82,7 +82,7 @@ class Stage(L.LightningModule, ABC):
         if found != self.stage:
             raise ValueError(
                 f"the checkpoint is of stage {found!r}, this is {self.stage!r}; to start a stage "
-                "from another one, give model.init_from instead of ckpt_path"
+                "from another one, give --model.init_args.init_from instead of --ckpt_path"
             )
         for state in checkpoint.get("optimizer_states", []):
             for group in state["param_groups"]:
