@@ -52,11 +52,12 @@ COMMANDS = {
     "ablate": Command("bench:ablate", "train and compare the paper's ablations", resumable=True),
     "bench sampling": Command("bench:sampling", "measure accuracy against sampling time", True),
     "bench training": Command("bench:training", "measure time and memory of training steps"),
+    "completion": Command("completion:completion", "print a script that completes in bash"),
 }
 OWN_PARSER = ("presets:run", "features:features")
 # Commands of `data` and `edit` are known by their own name, too: `r3dpa view` is `r3dpa data view`.
-_ALIASES = {name.split()[1]: name for name in COMMANDS if name.startswith(("data ", "edit "))}
-_GROUPS = tuple(dict.fromkeys(name.split()[0] for name in COMMANDS if " " in name))
+ALIASES = {name.split()[1]: name for name in COMMANDS if name.startswith(("data ", "edit "))}
+GROUPS = tuple(dict.fromkeys(name.split()[0] for name in COMMANDS if " " in name))
 
 
 def _help(group: str) -> str:
@@ -70,13 +71,13 @@ def _help(group: str) -> str:
 
 
 def _find(args: list[str]) -> tuple[str, list[str]]:
-    name = " ".join(args[: 2 if args[0] in _GROUPS else 1])
+    name = " ".join(args[: 2 if args[0] in GROUPS else 1])
     rest = args[len(name.split()) :]
-    name = name if name in COMMANDS else _ALIASES.get(name, name)
+    name = name if name in COMMANDS else ALIASES.get(name, name)
     if name not in COMMANDS:
         from r3dpa.cli.messages import suggestion
 
-        near = suggestion(name, [*COMMANDS, *_ALIASES])
+        near = suggestion(name, [*COMMANDS, *ALIASES])
         hint = near or f"; choose from {', '.join(COMMANDS)}"
         sys.stderr.write(f"r3dpa: unknown command '{name}'{hint}\n")
         sys.exit(2)
@@ -89,7 +90,7 @@ def _run(args: list[str]) -> None:
 
         sys.stdout.write(f"{__version__}\n")
         return
-    group = args[0] if args and args[0] in _GROUPS else ""
+    group = args[0] if args and args[0] in GROUPS else ""
     rest = args[1:] if group else args
     if not rest or rest[0] in ("-h", "--help"):
         sys.stdout.write(f"{_help(group)}\n")
@@ -137,5 +138,5 @@ def main(args: list[str] | None = None) -> None:
         message = str(error)
         if message.startswith("Caught "):  # in a process of a data loader, with its traceback
             message = message.strip().splitlines()[-1].partition(": ")[2]
-        name = " ".join(args[: 2 if args[0] in _GROUPS else 1])
+        name = " ".join(args[: 2 if args[0] in GROUPS else 1])
         sys.exit(f"r3dpa {name}: {message}")

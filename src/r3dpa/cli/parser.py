@@ -59,7 +59,11 @@ class HelpFormatter(DefaultHelpFormatter):
 
     def _get_type_str(self, action: argparse.Action) -> str | None:
         name = super()._get_type_str(action)
-        return name and name.removeprefix("<class '").removesuffix("'>").removesuffix(" | null")
+        if name is None:
+            return None
+        if name.startswith("Optional["):
+            name = name[len("Optional[") : -1]
+        return name.removeprefix("<class '").removesuffix("'>").removesuffix(" | null")
 
 
 class Parser(ArgumentParser):
@@ -93,7 +97,7 @@ class Parser(ArgumentParser):
         texts = [super().format_help()]
         for action in self._actions:
             kinds = [k for k in get_args(getattr(action, "_typehint", None)) if k is not type(None)]
-            if len(kinds) == 1 and is_dataclass(kinds[0]):
+            if len(kinds) == 1 and is_dataclass(kinds[0]) and not action.dest.endswith(".help"):
                 fields = ArgumentParser(add_help=False, formatter_class=HelpFormatter)
                 fields.add_class_arguments(kinds[0], action.dest)
                 texts.append(fields.format_help().partition("\n\n")[2])
@@ -173,10 +177,8 @@ def load(target: str) -> Callable[..., Any]:
     return cast(Callable[..., Any], getattr(module, name))
 
 
-def parse(
-    function: Callable[..., Any], words: Sequence[str], prog: str
-) -> tuple[Parser, Namespace]:
-    """Make the parser of a function, and parse a command line with it.
+def make_parser(function: Callable[..., Any], prog: str | None = None) -> Parser:
+    """Make the parser of a function.
 
     Keyword-only arguments are options, and so are those of functions outside this package.
     """
@@ -185,6 +187,14 @@ def parse(
     parser = Parser(prog=prog, description=description)
     parser.add_argument("--config", action="config", help="YAML file with options")
     parser.add_function_arguments(function, as_positional=positional, as_group=False)
+    return parser
+
+
+def parse(
+    function: Callable[..., Any], words: Sequence[str], prog: str
+) -> tuple[Parser, Namespace]:
+    """Make the parser of a function, and parse a command line with it."""
+    parser = make_parser(function, prog)
     parser.words = words
     return parser, parser.parse_args(join_list_words(parser, words))
 
