@@ -76,7 +76,7 @@ def test_a_folder_without_a_split_of_kitti360(tmp_path, refused):
         ("data: {init_args: {bacth_size: 3}}", "bacth_size"),
         ("optimiser: {lr: 3}", "optimiser"),
         ("--data.init_args.batch_size=many", "batch_size"),
-        ("--scorer.batch_size=0", "--scorer.batch_size: Not of type PositiveInt: 0"),
+        ("--scorer.batch_size=0", "--scorer.batch_size: expected a number above 0, got 0"),
         ("--config=conf/nothing.yaml", "conf/nothing.yaml"),
     ],
 )

@@ -96,7 +96,7 @@ def test_usage_errors_name_the_word(words, message, capsys):
         (["report", "nowhere"], "r3dpa report: nowhere holds no version_"),
         (["sample", "--ckpt", "no.ckpt", "--out", "x"], "r3dpa sample: no checkpoint file no"),
         (["convert", "no.pt", "x.pt"], "r3dpa convert: no checkpoint file no.pt"),
-        (["edit", "vary", "--ckpt", "a", "--scan", "b", "--out", "f"], "r3dpa edit vary: f is a f"),
+        (["edit", "vary", "--scan", "f", "--out", "f"], "r3dpa edit vary: f is a f"),
         (
             ["fit", "jointly"],
             "r3dpa fit: unknown stage 'jointly' (did you mean joint?); choose from few_step",

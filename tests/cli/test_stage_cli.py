@@ -72,7 +72,11 @@ def test_a_stage_of_range_images_needs_batches_of_them(smoke_args, tmp_path):
 @pytest.mark.parametrize(
     ("model", "data", "message"),
     [
-        ("r3dpa.modules.Nothing", "BoringDataModule", "r3dpa fit: --model: .*r3dpa.modules.Noth"),
+        (
+            "r3dpa.modules.Nothing",
+            "BoringDataModule",
+            "r3dpa fit: --model: module .r3dpa.modules. has no attribute .Nothing",
+        ),
         (f"{BORING}.BoringModel", "BoringModel", "r3dpa fit: --data: .*BoringModel"),
     ],
 )

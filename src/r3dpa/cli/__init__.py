@@ -23,10 +23,10 @@ class Command(NamedTuple):
 
 
 COMMANDS = {
-    "fit": Command("presets:run", "train a stage: r3dpa fit joint --preset demo"),
-    "validate": Command("presets:run", "evaluate on the validation split"),
-    "test": Command("presets:run", "sample scenes and compare them with real scans"),
-    "predict": Command("presets:run", "reconstruct scans with a checkpoint"),
+    "fit": Command("fit:run", "train a stage: r3dpa fit joint --preset demo"),
+    "validate": Command("fit:run", "evaluate on the validation split"),
+    "test": Command("fit:run", "sample scenes and compare them with real scans"),
+    "predict": Command("fit:run", "reconstruct scans with a checkpoint"),
     "data simulate": Command("lidarsim:simulate", "write simulated scans", True),
     "data check": Command("data:check", "list bad scans and missing folders of a data set"),
     "data convert": Command("lidarsim.conversion:convert", "write scans in another format"),
@@ -54,7 +54,7 @@ COMMANDS = {
     "bench training": Command("bench:training", "measure time and memory of training steps"),
     "completion": Command("completion:completion", "print a script that completes in bash"),
 }
-OWN_PARSER = ("presets:run", "features:features")
+OWN_PARSER = ("fit:run", "features:features")
 # Commands of `data` and `edit` are known by their own name, too: `r3dpa view` is `r3dpa data view`.
 ALIASES = {name.split()[1]: name for name in COMMANDS if name.startswith(("data ", "edit "))}
 GROUPS = tuple(dict.fromkeys(name.split()[0] for name in COMMANDS if " " in name))

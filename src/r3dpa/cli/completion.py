@@ -38,7 +38,7 @@ def completion(shell: Literal["bash"]) -> str:
     short_names = {name: alias for alias, name in ALIASES.items()}
     cases = []
     for name, command in COMMANDS.items():
-        if command.target == "presets:run":
+        if command.target == "fit:run":
             cases.append(_case(f'"{name} "', f"{' '.join(stage_files())} {_STAGE}"))
             cases.append(_case(f'"{name} "*', _STAGE))
             continue

@@ -73,9 +73,10 @@ def view(
             values.
     """
     from r3dpa import viz
-    from r3dpa.cli.scene_files import page_scans, write_page
+    from r3dpa.cli.scene_files import page_scans
     from r3dpa.data.scans import evenly
     from r3dpa.geometry import LidarSensor, SphericalProjection
+    from r3dpa.viz.scenes import write_page
 
     check_folder(out)
     readers = page_scans(source, columns)

@@ -2,28 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 from importlib.resources import files
 from pathlib import Path
 from typing import NamedTuple
 
 from r3dpa.cli.messages import suggestion
-from r3dpa.pretrained import weights_file
 
 DEFAULT_PRESET = "kitti360"
 _STAGE_FOLDERS = ("experiment", "baseline")
-# Options of the stage commands, those of Lightning included, or the first part of their names.
-_OPTIONS = (
-    *("help", "config", "print_config", "preset", "run_dir", "ckpt_path", "allow_import"),
-    *("model", "data", "trainer", "checkpoint", "scorer", "optimizer", "lr_scheduler"),
-    *("seed_everything", "weights_only", "return_predictions", "verbose", "datamodule"),
-)
-_CHECKPOINT_OPTIONS = (
-    "--ckpt_path",
-    "--model.init_args.init_from",
-    "--model.init_args.rgb_weights",
-)
-_CHECKPOINT_WORDS = ("last", "best", "hpc", "null")  # of --ckpt_path, beside files
 
 
 class StageWords(NamedTuple):
@@ -39,11 +25,13 @@ def conf_folder() -> Path:
 
 
 def stage_files() -> dict[str, Path]:
-    """Return the configurations that name a model, by stage; overlays such as ``*_demo`` do not."""
-    paths = [
-        p for folder in _STAGE_FOLDERS for p in sorted((conf_folder() / folder).glob("*.yaml"))
-    ]
-    return {path.stem: path for path in paths if "\n  class_path: " in path.read_text()}
+    """Return the configurations that choose a model, by stage; overlays such as ``*_demo`` do not."""
+    stages = {}
+    for folder in _STAGE_FOLDERS:
+        for path in sorted((conf_folder() / folder).glob("*.yaml")):
+            if "\nmodel:\n  class_path: " in path.read_text():
+                stages[path.stem] = path
+    return stages
 
 
 def expand_preset(words: list[str]) -> StageWords:
@@ -77,63 +65,7 @@ def preset_names() -> list[str]:
     return [path.stem for path in sorted((conf_folder() / "data").glob("*.yaml"))]
 
 
-def run(args: list[str]) -> None:
-    """Run a stage command, ``["fit", "joint"]``, and answer simple mistakes at once.
-
-    Raises:
-        ValueError: If a stage, preset or option is unknown.
-        FileNotFoundError: If a configuration or checkpoint does not exist.
-    """
-    command, words = args[0], args[1:]
-    overview = _overview(command)
-    if "-h" in words or "--help" in words:
-        sys.stdout.write(f"{overview}\n")
-        sys.stdout.flush()  # the options of Lightning follow after seconds
-    elif not any(word.startswith(("--config", "--model", "-c")) for word in words) and (
-        not words or words[0].startswith("-")
-    ):
-        sys.stderr.write(f"{overview}\n\nr3dpa {command}: give a stage, or --config FILE\n")
-        sys.exit(2)
-    _check_words(expand_preset(words).words)
-    from r3dpa.cli.stages import run as run_stage
-
-    run_stage(args)
-
-
-def _overview(command: str) -> str:
-    """What a stage command takes, before the options that Lightning lists."""
-    lines = [f"usage: r3dpa {command} STAGE [--preset NAME] [options]"]
-    lines += [f"       r3dpa {command} --config FILE [--config FILE ...] [options]", "", "stages:"]
-    for stage, path in stage_files().items():
-        comment = path.read_text().partition("\n")[0].removeprefix("# ")
-        lines.append(f"  {stage:<17}{comment.partition(': ')[0].rstrip(':.')}")
-    lines += ["", f"presets (data; default: {DEFAULT_PRESET}):", f"  {', '.join(preset_names())}"]
-    lines += ["", "A run writes to --run_dir; --ckpt_path last resumes it."]
-    return "\n".join(lines)
-
-
 def _check_known(kind: str, name: str, known: list[str]) -> None:
     if name not in known:
         near = suggestion(name, known)
         raise ValueError(f"unknown {kind} '{name}'{near}; choose from {', '.join(known)}")
-
-
-def _check_words(words: list[str]) -> None:
-    """Refuse unknown options and absent files, as far as that needs no class."""
-    for place, word in enumerate(words):
-        option, equals, value = word.partition("=")
-        if not option.startswith("--"):
-            continue
-        name = option[2:].partition(".")[0].rstrip("+")
-        if not any(known.startswith(name) for known in _OPTIONS):  # argparse takes short forms
-            near = suggestion(option, [f"--{known}" for known in _OPTIONS])
-            raise ValueError(f"unknown option {option}{near}")
-        if not equals:
-            value = words[place + 1] if place + 1 < len(words) else ""
-        if option == "--config" and value.endswith((".yaml", ".yml")) and not Path(value).exists():
-            raise FileNotFoundError(f"--config {value}: no such file")
-        if option in _CHECKPOINT_OPTIONS and not value.startswith((*_CHECKPOINT_WORDS, "hf:/")):
-            try:
-                weights_file(value)
-            except FileNotFoundError as error:
-                raise FileNotFoundError(f"{option}: {error}") from None

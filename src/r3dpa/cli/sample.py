@@ -60,11 +60,12 @@ def sample(
 
     from r3dpa.baselines import scene_generator
     from r3dpa.checkpoints import read_checkpoint, read_snapshot
-    from r3dpa.cli.scene_files import draw_all, generate_all, provenance, written
+    from r3dpa.cli.scene_files import generate_all, provenance, written
     from r3dpa.data.scene_writer import SceneWriter
     from r3dpa.generation import Autoguidance, SamplerConfig
     from r3dpa.io import usable_device
     from r3dpa.nn import ThinDecoder
+    from r3dpa.viz.scenes import draw_scenes
 
     of_solver = ("solver", "steps", "shift", "eta", "sde_last")
     given = {name: arguments[name] for name in of_solver if arguments[name] is not None}
@@ -111,7 +112,7 @@ def sample(
     projection = generator.geometry.projection
     with SceneWriter(files.out, num, projection, files.formats, request, files.overwrite) as writer:
         measured = generate_all(generator, writer, files.batch_size, files.seed)
-        opened = draw_all(files.out, writer.range_path, files.pictures, generator.geometry)
+        opened = draw_scenes(files.out, writer.range_path, files.pictures, generator.geometry)
         writer.finish(request | measured)
     line = f"{num} scenes in {files.out}: {measured['nfe']:.5g} network evaluations each"
     if measured["drawn_by_last_run"]:
