@@ -137,6 +137,14 @@ class Simulator:
         self.sensor = load_sensor(sensor) if isinstance(sensor, str) else sensor
         self.switches = check_switches(effects or {})
 
+    def __repr__(self) -> str:
+        street = self.street
+        weather = street.weather or "drawn"
+        return (
+            f"Simulator(seed={street.seed}, drive={street.drive}, weather={weather}, "
+            f"{len(self.sensor.lasers.inclination_rad)} beams)"
+        )
+
     def scan(self, number: int) -> SimulatedScan:
         """Scan ``number`` of the drive, 0 or greater; neighbours are 0.1 s apart."""
         scene = self.street.scene(number, self.sensor.mount_height_m)

@@ -54,6 +54,7 @@ def run(args: list[str]) -> None:
         FileNotFoundError: If a checkpoint does not exist.
     """
     command, words = args[0], args[1:]
+    _check_words(command, words)
     overview = _overview(command)
     if "-h" in words or "--help" in words:
         sys.stdout.write(f"{overview}\n")
@@ -61,7 +62,7 @@ def run(args: list[str]) -> None:
     elif not _names_stage(words):
         sys.stderr.write(f"{overview}\n\n")
         _refuse(command, "give a stage, or --config FILE")
-    _check_words(command, expand_preset(words).words)
+    expand_preset(words)  # refuses an unknown stage or preset
     from r3dpa.cli.stages import run as run_stage
 
     run_stage(args)
@@ -105,9 +106,9 @@ def _check_words(command: str, words: list[str]) -> None:
             _refuse(command, f"unknown option {option}{near}")
         if not equals:
             value = words[place + 1] if place + 1 < len(words) else ""
-        if option == "--config" and value.endswith((".yaml", ".yml")):
-            if not Path(value).exists() and not (conf_folder().parent / value).exists():
-                _refuse(command, f"--config: no file {value}")
+        is_file = Path(value).exists() or (conf_folder().parent / value).exists()
+        if option == "--config" and value.endswith((".yaml", ".yml")) and not is_file:
+            _refuse(command, f"--config: no file {value}")
         if option in checkpoint_options and not value.startswith((*_CHECKPOINT_WORDS, "hf:/")):
             try:
                 weights_file(value)

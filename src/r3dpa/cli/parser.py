@@ -79,8 +79,9 @@ class Parser(ArgumentParser):
         if kwargs.get("type") is bool:
             kwargs |= {"nargs": "?", "const": True}
         name = args[0].removeprefix("--")
-        if args[0] != name and name in _COMMON_NAMES:
-            args = (_COMMON_NAMES[name], *args)
+        is_count = name == "scans" and kwargs.get("type") is int  # elsewhere a folder
+        if args[0] != name and (name in _COMMON_NAMES or is_count):
+            args = ("--num" if is_count else _COMMON_NAMES[name], *args)
             kwargs["dest"] = name
         return super().add_argument(*args, **kwargs)
 

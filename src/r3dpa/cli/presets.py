@@ -25,7 +25,7 @@ def conf_folder() -> Path:
 
 
 def stage_files() -> dict[str, Path]:
-    """Return the configurations that choose a model, by stage; overlays such as ``*_demo`` do not."""
+    """Return the configurations that choose a model, by stage; overlays do not choose one."""
     stages = {}
     for folder in _STAGE_FOLDERS:
         for path in sorted((conf_folder() / folder).glob("*.yaml")):

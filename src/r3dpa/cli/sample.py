@@ -55,7 +55,6 @@ def sample(
         compile: Compile the networks: a minute or more at first, then faster.
         **options: See :class:`SceneOptions`.
     """
-    arguments = dict(locals())
     from dataclasses import asdict
 
     from r3dpa.baselines import scene_generator
@@ -67,8 +66,14 @@ def sample(
     from r3dpa.nn import ThinDecoder
     from r3dpa.viz.scenes import draw_scenes
 
-    of_solver = ("solver", "steps", "shift", "eta", "sde_last")
-    given = {name: arguments[name] for name in of_solver if arguments[name] is not None}
+    settings = {
+        "solver": solver,
+        "steps": steps,
+        "shift": shift,
+        "eta": eta,
+        "sde_last": sde_last,
+    }
+    given = {name: value for name, value in settings.items() if value is not None}
     if quality is not None and given:
         raise ValueError(f"--quality {quality} chooses what --{next(iter(given))} gives; drop one")
     sampler = SamplerConfig(**given) if given else quality
