@@ -86,7 +86,7 @@ class Parser(ArgumentParser):
         return super().add_argument(*args, **kwargs)
 
     def parse_args(self, args: Any = None, *others: Any, **settings: Any) -> Any:
-        """Parses words, in which classes may have the import paths of earlier versions."""
+        """Parse words, in which classes may have the import paths of earlier versions."""
         words = []
         for word in sys.argv[1:] if args is None else args:
             name, equals, value = word.rpartition("=")  # --option=class or class
@@ -230,19 +230,19 @@ ODESolver = Literal["euler", "heun", "midpoint", "ab2", "ab3", "dpmpp_2m", "unip
 
 @dataclass(frozen=True, kw_only=True)
 class SceneOptions:
-    """Checkpoint that makes scenes, and files that they are written to.
+    """Checkpoint that generates scenes, and files that they are written to.
 
     Args:
         ckpt: Checkpoint of stage joint or flow_matching, ``.ckpt`` or exported ``.safetensors``, a
             name of ``r3dpa models``, or ``hf://owner/name``.
         out: Folder for scenes, pictures, page and metadata; must not hold other scenes.
         seed: Scene i depends on (seed, i) alone, not on the batch size.
-        batch_size: Scenes made together.
+        batch_size: Scenes generated together.
         device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
         weights: Averaged (``ema``) or last weights of the SiT.
         formats: Files of points: ``bin``, ``ply``, ``npz``; ``range_m.npy`` is always written.
         pictures: Number of scenes to draw.
-        overwrite: Write into a folder that holds scenes already, and start anew.
+        overwrite: Replace the scenes of a folder.
     """
 
     out: Path
@@ -261,11 +261,11 @@ class SceneOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class EditOptions(SceneOptions):
-    """Those of all edits.
+    """Options shared by all edits.
 
     Args:
-        solver: ODE solver, to noise and back; ``midpoint`` loses least on that way.
-        steps: Solver steps of a whole way.
+        solver: ODE solver, to noise and back; ``midpoint`` has the least error there and back.
+        steps: Solver steps from data to noise.
         shift: Finer steps near noise (above 1) or data (below 1).
     """
 
@@ -275,14 +275,14 @@ class EditOptions(SceneOptions):
 
 
 def check_folder(out: Path | None) -> None:
-    """Refuses an output folder whose place is taken by a file, before the work starts."""
+    """Refuse an output folder whose path is a file, before the work starts."""
     for folder in () if out is None else (out, *out.parents):
         if folder.is_file():
             raise ValueError(f"{folder} is a file; give another --out")
 
 
 def check_file(out: Path | None) -> None:
-    """Refuses an output file whose place is taken by a folder, before the work starts."""
+    """Refuse an output file whose path is a folder, before the work starts."""
     if out is not None and out.is_dir():
         raise ValueError(f"{out} is a folder; give --out the name of a file")
     check_folder(None if out is None else out.parent)

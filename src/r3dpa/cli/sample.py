@@ -29,9 +29,9 @@ def sample(
 ) -> str:
     """Generate scenes from a checkpoint: points, range images, pictures and a page to turn.
 
-    Where the checkpoint generates them, points have an intensity, and ``labels`` holds their
-    classes of KITTI-360. The same command completes an interrupted run. An option that the solver
-    does not read is an error. ``metadata.json`` holds everything needed to repeat the run.
+    Points have an intensity, and ``labels`` the classes of KITTI-360, where the checkpoint
+    generates them. The same command completes an interrupted run. Options that the solver does not
+    read are refused. ``metadata.json`` holds everything needed to repeat the run.
 
     Args:
         num: Number of scenes.
@@ -44,7 +44,7 @@ def sample(
         shift: Finer steps near noise (above 1) or data (below 1) of the ODE; default: 1.
         eta: Noise strength of the SDE; default: 1, as published.
         sde_last: Last SDE step: ``denoise`` (default) or ``mean`` as in the official sampler.
-        autoguidance: Snapshot of a weaker model to be guided away from; doubles the evaluations.
+        autoguidance: Snapshot of a weaker model to guide away from; doubles the evaluations.
         guidance_scale: Strength of guidance, 1 for none; default: that of the weights, which are
             guided away from themselves without one attention map; 2 with ``--autoguidance``.
         guidance_interval: Times of autoguidance, such as ``0.2 0.8``; 0 is data, 1 noise; default:
@@ -121,7 +121,7 @@ def sample(
         writer.finish(request | measured)
     line = f"{num} scenes in {files.out}: {measured['nfe']:.5g} network evaluations each"
     if measured["drawn_by_last_run"]:
-        line += f", {measured['seconds_per_scene']:.3g} s a scene"
+        line += f", {measured['seconds_per_scene']:.3g} s per scene"
     chosen = quality or "good"
     measured_here = generator.sampler == SamplerConfig.of_quality(chosen)  # not a baseline's
     note = SamplerConfig.quality_line(chosen) if measured_here and not given else ""

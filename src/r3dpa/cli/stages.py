@@ -277,8 +277,10 @@ class StageCLI(LightningCLI):
 
 
 def _newest(run_dir: Path) -> str | None:
-    found = list((run_dir / "checkpoints").glob("[!.]*.ckpt"))
-    return str(max(found, key=lambda path: path.stat().st_mtime_ns)) if found else None
+    """Newest checkpoint of a run, if it has one."""
+    checkpoints = (run_dir / "checkpoints").glob("[!.]*.ckpt")
+    newest = max(checkpoints, key=lambda path: path.stat().st_mtime_ns, default=None)
+    return None if newest is None else str(newest)
 
 
 def run(args: list[str]) -> None:
