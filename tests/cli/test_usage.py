@@ -26,8 +26,8 @@ MISTAKES = {
     "sample --out x --ckpt no.ckpt": "no checkpoint file no.ckpt",
     "sample --out x --stpes 3": "unknown option --stpes (did you mean --steps?)",
     "edit vary --scan no.bin --out x": "--scan no.bin: no such file or folder",
-    "edit mix --left a.bin --right b.bin --out x": "r3dpa-s.safetensors was trained without 3D features",
-    "data objects --data x --out o.safetensors": "r3dpa-s.safetensors was trained without 3D features",
+    "edit mix --left a.bin --right b.bin --out x": "s.safetensors was trained without 3D features",
+    "data objects --data x --out o.safetensors": "s.safetensors was trained without 3D features",
     "evaluate --samples no --reference no": "--samples no: no such file or folder",
 }
 
