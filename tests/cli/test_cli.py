@@ -93,9 +93,9 @@ def test_usage_errors_name_the_word(words, message, capsys):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["report", "nowhere"], "r3dpa report: nowhere holds no version_"),
+        (["report", "nowhere"], "r3dpa report: nowhere: no such file or folder"),
         (["sample", "--ckpt", "no.ckpt", "--out", "x"], "r3dpa sample: no checkpoint file no"),
-        (["convert", "no.pt", "x.pt"], "r3dpa convert: no checkpoint file no.pt"),
+        (["convert", "no.pt", "x.pt"], "r3dpa convert: no.pt: no such file or folder"),
         (["edit", "vary", "--scan", "f", "--out", "f"], "r3dpa edit vary: f is a f"),
         (
             ["fit", "jointly"],

@@ -7,11 +7,10 @@ import sys
 
 import pytest
 
-from r3dpa.cli import ALIASES, COMMANDS, main
+from r3dpa.cli import ALIASES, COMMANDS, OWN_PARSER, main
 from r3dpa.cli.parser import load, make_parser
 from r3dpa.cli.presets import expand_preset, stage_files
 
-OWN_PARSERS = ("fit:run", "features:features")
 MISTAKES = {
     "fit": "give a stage, or --config FILE",
     "fit jointly": "unknown stage 'jointly' (did you mean joint?)",
@@ -28,6 +27,12 @@ MISTAKES = {
     "edit vary --scan no.bin --out x": "--scan no.bin: no such file or folder",
     "edit mix --left a.bin --right b.bin --out x": "s.safetensors was trained without 3D features",
     "data objects --data x --out o.safetensors": "s.safetensors was trained without 3D features",
+    "data view no": "no: no such file or folder",
+    "data weather no --out x": "no: no such file or folder",
+    "data features --data no/data": "--data no/data: no such folder of scans or data YAML",
+    "data reference --data no --out x.safetensors": "--data no: no such file or folder",
+    "convert no.pt x.safetensors": "no.pt: no such file or folder",
+    "report no": "no: no such file or folder",
     "evaluate --samples no --reference no": "--samples no: no such file or folder",
 }
 
@@ -137,7 +142,7 @@ def test_common_names_of_options():
     """How many of something are made or read is ``--num``, processes are ``--workers``."""
     counts = {"--limit", "--frames", "--scenes", "--jobs"}
     for command in COMMANDS.values():
-        if command.target not in OWN_PARSERS:
+        if command.target not in OWN_PARSER:
             names = [action.option_strings for action in make_parser(load(command.target))._actions]
             assert not [strings for strings in names if strings and strings[0] in counts]
     simulate = make_parser(load("lidarsim:simulate"))

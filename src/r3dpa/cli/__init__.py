@@ -31,7 +31,7 @@ COMMANDS = {
     "data check": Command("data:check", "list bad scans and missing folders of a data set"),
     "data convert": Command("lidarsim.conversion:convert", "write scans in another format"),
     "data view": Command("data:view", "draw scans: pictures and a page with point clouds"),
-    "data features": Command("features:features", "write feature grids of scans", resumable=True),
+    "data features": Command("fit:features", "write feature grids of scans", resumable=True),
     "data objects": Command("data:objects", "write mean features of object classes for inpaint"),
     "data reference": Command("evaluate:reference", "write statistics of real scans", True),
     "data weather": Command("weather:weather", "simulate weather on recorded scans", True),
@@ -54,7 +54,7 @@ COMMANDS = {
     "bench training": Command("bench:training", "measure time and memory of training steps"),
     "completion": Command("completion:completion", "print a script that completes in bash"),
 }
-OWN_PARSER = ("fit:run", "features:features")
+OWN_PARSER = ("fit:run", "fit:features")
 # Commands of `data` and `edit` are known by their own name, too: `r3dpa view` is `r3dpa data view`.
 ALIASES = {name.split()[1]: name for name in COMMANDS if name.startswith(("data ", "edit "))}
 GROUPS = tuple(dict.fromkeys(name.split()[0] for name in COMMANDS if " " in name))

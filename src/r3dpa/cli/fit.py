@@ -1,8 +1,9 @@
-"""``r3dpa fit``, ``validate``, ``test`` and ``predict``: simple mistakes are answered at once."""
+"""Commands whose parsers need Lightning: simple mistakes are answered before it is imported."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NoReturn
 
@@ -68,6 +69,20 @@ def run(args: list[str]) -> None:
     run_stage(args)
 
 
+def features(args: list[str]) -> None:
+    """Run ``data features``, given its name and the words after it.
+
+    Raises:
+        ValueError: If the data do not exist.
+    """
+    for option, value in _options(args[1:]):
+        if option == "--data" and "/" in value and not Path(value).exists():
+            raise ValueError(f"--data {value}: no such folder of scans or data YAML")
+    from r3dpa.cli.features import features as write_features
+
+    write_features(args)
+
+
 def _names_stage(words: list[str]) -> bool:
     """Whether the words start with a stage, or give a configuration or a model."""
     if words and not words[0].startswith("-"):
@@ -93,19 +108,22 @@ def _refuse(command: str, problem: str) -> NoReturn:
     sys.exit(2)
 
 
+def _options(words: list[str]) -> Iterator[tuple[str, str]]:
+    """Options and the word after each, or the text after its ``=``."""
+    for word, following in zip(words, [*words[1:], ""], strict=True):
+        option, equals, value = word.partition("=")
+        if option.startswith("--"):
+            yield option, value if equals else following
+
+
 def _check_words(command: str, words: list[str]) -> None:
     """Refuse unknown options and absent files, as far as that needs no class."""
     checkpoint_options = () if "--print_config" in words else _CHECKPOINT_OPTIONS
-    for place, word in enumerate(words):
-        option, equals, value = word.partition("=")
-        if not option.startswith("--"):
-            continue
+    for option, value in _options(words):
         name = option[2:].partition(".")[0].rstrip("+")
         if not any(known.startswith(name) for known in _OPTIONS):  # argparse takes short forms
             near = suggestion(option, [f"--{known}" for known in _OPTIONS])
             _refuse(command, f"unknown option {option}{near}")
-        if not equals:
-            value = words[place + 1] if place + 1 < len(words) else ""
         is_file = Path(value).exists() or (conf_folder().parent / value).exists()
         if option == "--config" and value.endswith((".yaml", ".yml")) and not is_file:
             _refuse(command, f"--config: no file {value}")

@@ -45,7 +45,19 @@ def _load_yaml_of_any_version(text: str) -> Any:
 set_loader("yaml", _load_yaml_of_any_version, (yaml.YAMLError,))
 # One word for one thing in all commands; the function's own name is an option as well.
 _COMMON_NAMES = {"limit": "--num", "frames": "--num", "scenes": "--num", "jobs": "--workers"}
-_INPUT_FILES = ("scan", "left", "right", "mask", "objects", "samples", "reference", "scans")
+# Files and folders that must exist: options, and words without one.
+_INPUT_OPTIONS = (
+    "scan",
+    "left",
+    "right",
+    "mask",
+    "objects",
+    "samples",
+    "reference",
+    "scans",
+    "data",
+)
+_INPUT_WORDS = ("source", "path", "run", "file")
 
 
 class HelpFormatter(DefaultHelpFormatter):
@@ -219,10 +231,11 @@ def _check_inputs(arguments: Mapping[str, Any]) -> None:
     ckpt = arguments.get("ckpt")
     if isinstance(ckpt, Path) and not str(ckpt).startswith("hf:/"):
         weights_file(ckpt)
-    for name in _INPUT_FILES:
+    for name in (*_INPUT_WORDS, *_INPUT_OPTIONS):
         path = arguments.get(name)
         if isinstance(path, Path) and not path.exists():
-            raise FileNotFoundError(f"--{name} {path}: no such file or folder")
+            option = f"--{name} " if name in _INPUT_OPTIONS else ""
+            raise ValueError(f"{option}{path}: no such file or folder")
 
 
 ODESolver = Literal["euler", "heun", "midpoint", "ab2", "ab3", "dpmpp_2m", "unipc"]
