@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import NoReturn
 
@@ -110,7 +111,7 @@ def _refuse(command: str, problem: str) -> NoReturn:
 
 def _options(words: list[str]) -> Iterator[tuple[str, str]]:
     """Options and the word after each, or the text after its ``=``."""
-    for word, following in zip(words, [*words[1:], ""], strict=True):
+    for word, following in pairwise([*words, ""]):
         option, equals, value = word.partition("=")
         if option.startswith("--"):
             yield option, value if equals else following
