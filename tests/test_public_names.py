@@ -7,7 +7,6 @@ import pytest
 
 import lidarsim
 import r3dpa
-from lidarsim.scene import Weather
 
 PACKAGE = Path(r3dpa.__file__).parent
 
@@ -20,9 +19,9 @@ def test_public_names_are_listed_and_exist(package):
 
 def test_a_simulator_is_described_in_one_line():
     assert repr(lidarsim.Simulator(3)) == "Simulator(seed=3, drive=0, weather=drawn, 64 beams)"
-    rainy = lidarsim.Simulator(weather=Weather(rain_mm_h=3), sensor="hdl32e")
-    assert "rain_mm_h=3" in repr(rainy)
-    assert repr(rainy).endswith("32 beams)")
+    weather = lidarsim.Simulator(3).street.scene(0).weather
+    given = lidarsim.Simulator(3, weather=weather, sensor="hdl32e")
+    assert f"weather={weather}, 32 beams)" in repr(given)
 
 
 @pytest.mark.parametrize("card", sorted(PACKAGE.rglob("*.md")), ids=lambda path: path.name)

@@ -133,6 +133,9 @@ class Simulator:
         sensor: str | SpinningLidar = "hdl64e",
         effects: Mapping[str, str | bool] | None = None,
     ) -> None:
+        if isinstance(weather, Mapping):
+            arguments = ", ".join(f"{name}={value}" for name, value in weather.items())
+            raise ValueError(f"weather must be an object such as Weather({arguments}), got a dict")
         self.street = Street(seed, drive, weather)
         self.sensor = load_sensor(sensor) if isinstance(sensor, str) else sensor
         self.switches = check_switches(effects or {})

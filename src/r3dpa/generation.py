@@ -218,6 +218,8 @@ class SceneGenerator:
 
     def with_sampler(self, sampler: SamplerConfig) -> SceneGenerator:
         """The same networks, compiled where these are, with another solver; both may be used."""
+        if not isinstance(sampler, SamplerConfig):
+            raise ValueError(f"sampler must be a SamplerConfig, got {sampler!r}")
         _check_average(sampler, self.sit, self._autoguidance)
         other = copy.copy(self)
         other._strong, other._weak = copy.copy(self._strong), copy.copy(self._weak)
@@ -449,6 +451,8 @@ def filled(values: Tensor, size: int) -> Tensor:
 
 def scene_indices(indices: int | Sequence[int]) -> Sequence[int]:
     """Numbers of scenes; a number stands for that many from 0 on. ``ValueError`` for none."""
+    if isinstance(indices, bool | str | float):
+        raise ValueError(f"give a number of scenes or their indices, got {indices!r}")
     numbers = range(int(indices)) if isinstance(indices, int | np.integer) else indices
     if len(numbers) == 0:
         raise ValueError("no scene is asked for: give a number of at least 1, or their indices")

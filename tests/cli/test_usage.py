@@ -202,6 +202,7 @@ def test_a_fit_says_what_it_lacks_and_what_follows(fitted):
     assert done.returncode == 0
     ckpt = run_dir / "checkpoints" / "last.ckpt"
     assert "without --model.init_args.rgb_weights the frozen SiT is random" in done.stderr
+    assert "global batch: 2 = 2 per process x 1 processes x 1 accumulated" in done.stderr
     next_command = f"next: r3dpa fit joint --model.init_args.init_from {ckpt}"
     assert done.stderr.splitlines()[-1] == f"checkpoint: {ckpt}; {next_command}"
 

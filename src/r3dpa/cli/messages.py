@@ -72,7 +72,7 @@ def describe_error(
         return f"unknown option --{place}{name}{suggestion(name, _argument_names(owner))}"
     if not keys:
         return _plain(reason)
-    names = next((a.option_strings for a in parser._actions if a.dest == keys[0]), [])
+    names = next((list(a.option_strings) for a in parser._actions if a.dest == keys[0]), [])
     typed = [name for name in names if name in words] or names or [f"--{keys[0]}"]
     return f"{'.'.join([typed[0], *keys[1:]])}: {_plain(reason)}"
 

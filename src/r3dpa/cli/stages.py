@@ -217,9 +217,22 @@ class StageCLI(LightningCLI):
             option, consequence = _WITHOUT_WEIGHTS.get(self.model.stage, ("", ""))
             if option and getattr(self.model, option) is None:
                 rank_zero_info(f"without --model.init_args.{option} {consequence}")
+        self._say_global_batch()
         for callback in self.trainer.callbacks:
             if isinstance(callback, _RecordConfig):
                 callback.hold_wandb_back(self.trainer)
+
+    def _say_global_batch(self) -> None:
+        """Name the samples per step, which grow with the number of processes."""
+        batch_size = getattr(self.datamodule, "batch_size", None)
+        if batch_size is None:
+            return
+        processes = self.trainer.world_size
+        accumulated = self.trainer.accumulate_grad_batches
+        rank_zero_info(
+            f"global batch: {batch_size * processes * accumulated} = {batch_size} per process x "
+            f"{processes} processes x {accumulated} accumulated"
+        )
 
     def after_fit(self) -> None:
         """Name the checkpoint, and the command that takes it."""

@@ -105,6 +105,11 @@ class LidarDataModule(LoaderModule):
         self.prepare_data_per_node = prepare_data_per_node
         at_least(2, val_every=val_every)
         at_least(1, limit=limit)
+        if not isinstance(sensor, LidarSensor):
+            raise ValueError(
+                "sensor must be a LidarSensor (image size, field of view and range limits), got "
+                f"{sensor!r}; the instrument of simulated scans is simulation_sensor"
+            )
         self.scans, self.sensor, self.codec = scans, sensor, codec
         self.projection_kind = projection
         self.grid_size = (grid_size[0], grid_size[1])
