@@ -66,7 +66,7 @@ def sample(
     from r3dpa.nn import ThinDecoder
     from r3dpa.viz.scenes import draw_scenes
 
-    settings = {
+    settings: dict[str, Any] = {
         "solver": solver,
         "steps": steps,
         "shift": shift,

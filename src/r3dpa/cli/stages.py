@@ -173,10 +173,10 @@ class StageCLI(LightningCLI):
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
         """Show losses in the bar; record the configuration before other callbacks start."""
-        trainer = super().instantiate_trainer(**kwargs)
+        trainer: Any = super().instantiate_trainer(**kwargs)
         callbacks = [LossBar() if type(c) is TQDMProgressBar else c for c in trainer.callbacks]
         trainer.callbacks = sorted(callbacks, key=lambda c: not isinstance(c, _RecordConfig))
-        return trainer
+        return cast(Trainer, trainer)
 
     def _parse_ckpt_path(self) -> None:
         """Check the local file, without which Lightning would run what a URL says."""
@@ -218,7 +218,7 @@ class StageCLI(LightningCLI):
             if option and getattr(self.model, option) is None:
                 rank_zero_info(f"without --model.init_args.{option} {consequence}")
         self._say_global_batch()
-        for callback in self.trainer.callbacks:
+        for callback in cast(Any, self.trainer).callbacks:
             if isinstance(callback, _RecordConfig):
                 callback.hold_wandb_back(self.trainer)
 
