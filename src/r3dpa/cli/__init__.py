@@ -56,7 +56,11 @@ COMMANDS = {
 }
 OWN_PARSER = ("fit:run", "fit:features")
 # Commands of `data` and `edit` are known by their own name, too: `r3dpa view` is `r3dpa data view`.
-ALIASES = {name.split()[1]: name for name in COMMANDS if name.startswith(("data ", "edit "))}
+ALIASES = {
+    name.split()[1]: name
+    for name in COMMANDS
+    if name.startswith(("data ", "edit ")) and name.split()[1] not in COMMANDS
+}
 GROUPS = tuple(dict.fromkeys(name.split()[0] for name in COMMANDS if " " in name))
 
 
@@ -73,7 +77,7 @@ def _help(group: str) -> str:
 def _find(args: list[str]) -> tuple[str, list[str]]:
     name = " ".join(args[: 2 if args[0] in GROUPS else 1])
     rest = args[len(name.split()) :]
-    name = name if name in COMMANDS else ALIASES.get(name, name)
+    name = ALIASES.get(name, name)
     if name not in COMMANDS:
         from r3dpa.cli.messages import suggestion
 
