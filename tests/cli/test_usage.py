@@ -41,8 +41,10 @@ MISTAKES = {
 def answers(tmp_path_factory):
     """Answers to the mistakes in one process, and whether torch was imported for one of them."""
     program = f"""
-import sys, json, io, contextlib
+import sys, json, io, contextlib, pathlib
 from r3dpa.cli import main
+for name in ("a.bin", "b.bin"):
+    pathlib.Path(name).touch()
 answers = []
 for line in {list(MISTAKES)}:
     text = io.StringIO()

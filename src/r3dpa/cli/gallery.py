@@ -38,7 +38,10 @@ def gallery(
         batch_size: Scenes generated together.
         device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
     """
+    from torch import Tensor
+
     from r3dpa.cli.features import read_data
+    from r3dpa.editing import SceneEditor, regions
     from r3dpa.generation import SceneGenerator
     from r3dpa.io import usable_device, write_text
     from r3dpa.viz.gallery import gallery_page
@@ -50,7 +53,19 @@ def gallery(
         module.setup("fit")
         if module.sensor != generator.geometry.projection.sensor:
             raise ValueError(f"{data}: is of another sensor than {ckpt}: {module.sensor}")
-    page = gallery_page(generator, str(ckpt), num, module, seed, batch_size)
+    projection = generator.geometry.projection
+    editor = SceneEditor(generator, batch_size=batch_size)
+
+    def edit(scene_m: Tensor) -> dict[str, Tensor]:
+        ahead = regions.angle_box(projection, -30, 30, -25, 3)
+        beams = regions.dropped_beams(projection, range(0, projection.sensor.beams, 2))
+        return {
+            "ahead generated anew": editor.inpaint(scene_m, ahead, 2, seed).range_m,
+            "every other beam filled": editor.complete(scene_m, beams, 1, seed).range_m,
+            "varied": editor.vary(scene_m, 2, seed).range_m,
+        }
+
+    page = gallery_page(generator, str(ckpt), num, edit, module, seed, batch_size)
     html = page.html("r3dpa gallery")
     write_text(out, html)
     return f"open {out}: {len(page.scans)} scenes, {len(html) / 1e6:.0f} MB"

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
+
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
 from lidarsim.weather import Weather
-from r3dpa.data import LidarDataModule
-from r3dpa.editing import SceneEditor, regions
-from r3dpa.generation import SceneGenerator
 from r3dpa.geometry import Projection, points_of, range_image
 from r3dpa.metrics.nearest import nearest_images
 from r3dpa.viz.page import PageScan, Tile, scan_page
 from r3dpa.viz.pictures import range_image_picture
+
+if TYPE_CHECKING:
+    from r3dpa.data import LidarDataModule
+    from r3dpa.generation import SceneGenerator
 
 _WEATHERS = {
     "fog, 60 m": Weather(visibility_m=60),
@@ -57,6 +61,7 @@ def gallery_page(
     generator: SceneGenerator,
     source: str,
     num: int,
+    edit: Callable[[Tensor], Mapping[str, Tensor]],
     data: LidarDataModule | None = None,
     seed: int = 0,
     batch_size: int = 8,
@@ -67,6 +72,7 @@ def gallery_page(
         generator: Makes the scenes.
         source: Name of its weights, for the text.
         num: Number of scenes.
+        edit: Edits of a scene ``(H, W)``: results ``(N, H, W)`` by name.
         data: Training data, set up for a fit, whose nearest scans are shown; None shows none.
         seed: Scenes and edits depend on it.
         batch_size: Scenes made together.
@@ -82,7 +88,9 @@ def gallery_page(
             page.add("Scenes", f"seed {number}", range_m)
     else:
         page.about.append(_add_with_nearest(page, scenes_m, data))
-    _add_edits(page, SceneEditor(generator, batch_size=batch_size), scenes_m[0], seed)
+    for name, results_m in edit(scenes_m[0]).items():
+        for range_m in results_m:
+            page.add("Edits of seed 0", name, range_m)
     points = points_of(scenes_m[0], projection)
     for name, weather in _WEATHERS.items():
         range_m = range_image(weather.apply(points, seed), projection)[0]
@@ -106,17 +114,3 @@ def _add_with_nearest(page: GalleryPage, scenes_m: Tensor, data: LidarDataModule
         f"{of_scenes.median():.2f}, of held-out scans {of_held_out.median():.2f} "
         "(log2 of the range)."
     )
-
-
-def _add_edits(page: GalleryPage, editor: SceneEditor, scene_m: Tensor, seed: int) -> None:
-    projection = page.projection
-    ahead = regions.angle_box(projection, -30, 30, -25, 3)
-    beams = regions.dropped_beams(projection, range(0, projection.sensor.beams, 2))
-    edits = {
-        "ahead generated anew": editor.inpaint(scene_m, ahead, 2, seed),
-        "every other beam filled": editor.complete(scene_m, beams, 1, seed),
-        "varied": editor.vary(scene_m, 2, seed),
-    }
-    for name, result in edits.items():
-        for range_m in result.range_m:
-            page.add("Edits of seed 0", name, range_m)
