@@ -104,7 +104,7 @@ demo: $(READY)
 	$(BIN)/r3dpa sample --num 16 --out '$(OUT)/r3dpa-s' --overwrite true
 	$(BIN)/r3dpa edit inpaint --scan '$(OUT)/r3dpa-s/bin/000000.bin' --box -30 30 -25 3 --num 2 \
 		--steps 16 --out '$(OUT)/edit' --overwrite true
-	$(BIN)/r3dpa data reference --data '$(REAL)' --limit 32 --out '$(OUT)/reference.safetensors'
+	$(BIN)/r3dpa data reference --data '$(REAL)' --num 32 --out '$(OUT)/reference.safetensors'
 	$(BIN)/r3dpa evaluate --samples '$(OUT)/r3dpa-s' --reference '$(OUT)/reference.safetensors' \
 		--allow_few --label before --out '$(OUT)/before'
 	$(FIT) --config conf/r3dpa_s/vae_alignment.yaml --config conf/r3dpa_s/demo_vae.yaml --run_dir '$(OUT)/vae'
@@ -150,7 +150,7 @@ bench-sampling: $(READY) ## what accuracy costs in time, for an exact velocity: 
 	OMP_NUM_THREADS=1 $(BIN)/r3dpa bench sampling --quick --out runs/bench_sampling
 
 ablations: $(READY) ## tables I to IV at the demo's size: hours on two cores; goes on where it stopped
-	OMP_NUM_THREADS=1 $(BIN)/r3dpa ablate conf/ablation --scale demo --jobs 2
+	OMP_NUM_THREADS=1 $(BIN)/r3dpa ablate conf/ablation --scale demo --workers 2
 
 # A checkpoint that fits, for the picture of a trained model: make bench-gpu CKPT=...
 CKPT ?=

@@ -76,7 +76,7 @@ def test_a_folder_without_a_split_of_kitti360(tmp_path, refused):
         ("data: {init_args: {bacth_size: 3}}", "bacth_size"),
         ("optimiser: {lr: 3}", "optimiser"),
         ("--data.init_args.batch_size=many", "batch_size"),
-        ("--scorer.batch_size=0", "--scorer.batch_size: Not of type PositiveInt: 0"),
+        ("--scorer.batch_size=0", "--scorer.batch_size: expected a number above 0, got 0"),
         ("--config=conf/nothing.yaml", "conf/nothing.yaml"),
     ],
 )
@@ -90,7 +90,7 @@ def test_an_option_or_key_that_cannot_be_is_named(option, named, tmp_path, refus
 
 def test_images_and_latents_that_do_not_fit(folder, refused):
     message = refused("joint", *data_args(folder), f"--{SIT}.input_size=[4, 8]")
-    assert "(16, 64) pixels give (4, 16) latents, but sit.input_size is (4, 8)" in message
+    assert "(16, 64) pixels give (4, 16) latents, but the SiT has input_size (4, 8)" in message
 
 
 @pytest.mark.filterwarnings("ignore:Attribute '.*' is an instance of `nn.Module`")
@@ -98,9 +98,9 @@ def test_images_and_latents_that_do_not_fit(folder, refused):
     ("data", "sit", "message"),
     [
         ({"features_dir": None}, {}, "joint aligns with 3D features, but the data module has none"),
-        ({"feature_dim": 16}, {"feature_dim": 20}, "width 16, but sit.feature_dim is 20"),
+        ({"feature_dim": 16}, {"feature_dim": 20}, "width 16, but the SiT has feature_dim 20"),
         ({}, {"input_size": [4, 8], "patch_size": 4}, "grids are .2, 4., but the SiT has .1, 2. t"),
-        ({}, {"in_channels": 8}, "sit.in_channels is 8, but the VAE has 4 latent channels"),
+        ({}, {"in_channels": 8}, "the SiT has in_channels 8, but the VAE has 4 latent channels"),
     ],
 )
 def test_networks_and_data_that_do_not_fit(data, sit, message):

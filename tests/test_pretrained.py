@@ -75,7 +75,7 @@ def test_a_stage_starts_from_averages_where_a_file_has_nothing_else(shipped):
 def test_unknown_names_are_answered_with_the_known_ones(shipped):
     with pytest.raises(FileNotFoundError, match=r"no checkpoint file large; .*\(tiny\)"):
         read_checkpoint("large")
-    with pytest.raises(ValueError, match="no weights 'large'; there are tiny"):
+    with pytest.raises(ValueError, match="unknown weights 'large'; choose from tiny"):
         pretrained.models("large")
 
 

@@ -104,7 +104,12 @@ _MODULES = {
 
 
 def __getattr__(name: str) -> Any:
-    """Imports a public name on first use: SciPy takes half a second."""
+    """Import a public name on first use: SciPy takes half a second."""
     if name not in _MODULES:
         raise AttributeError(f"module 'lidarsim' has no attribute {name!r}")
     return getattr(import_module(_MODULES[name]), name)
+
+
+def __dir__() -> list[str]:
+    """Names to complete after ``lidarsim.``, without importing them."""
+    return sorted(__all__)

@@ -8,6 +8,7 @@
         labels/%010d.label              (P,) uint32 semantic | instance << 16
         origins/%010d.origin            (P,) uint8 origin of each point, see ``Origin``
         sim/%010d.json                  summary of the scene and of each effect
+        boxes/%010d.txt                 3-D boxes of vehicles and people, see ``kitti_label``
     data_poses/2013_05_28_drive_XXXX_sync/
         velodyne_to_world.txt           one line a scan: number, then (3, 4) row by row
 
@@ -28,6 +29,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarsim.boxes import kitti_label
 from lidarsim.io import atomic_path, delete_unfinished
 from lidarsim.scan import SimulatedScan
 from lidarsim.scene import Conditions, Pose
@@ -90,6 +92,8 @@ class DriveFiles:
             "sim": to_json(summary),
             "data": scan.points.astype("<f4").tobytes(),
         }
+        boxes = kitti_label(scan, velodyne_to_world(scene.pose))
+        write(self.points_folder / "boxes" / f"{_stem(number)}.txt", boxes.encode())
         for kind in _SUFFIXES:
             write(self._path(kind, number), contents[kind])
 

@@ -24,7 +24,7 @@ from typing import Any, Literal, NamedTuple
 from lidarsim.drive_files import DriveFiles, drive_name, to_json, weather_to_dict, write
 from lidarsim.io import differences, in_processes, only_writer, text_table
 from lidarsim.scan import Simulator, check_switches
-from lidarsim.scene import Conditions
+from lidarsim.scene import Conditions, Semantic
 from lidarsim.sensors.spinning import SpinningLidar, load_sensor
 
 TRAIN_DRIVES = ("0003", "0004", "0005", "0006", "0007", "0009", "0010")
@@ -32,6 +32,7 @@ VAL_DRIVES = ("0000", "0002")
 VAL_SHARE = 0.2
 
 _MANIFEST = "simulation.json"
+_CLASSES = "classes.yaml"  # names of the class ids of the labels
 # Raised whenever the same request gives other scans than before.
 SIMULATOR_VERSION = 3
 # Neighbouring scans share their blocks of street, so a worker takes a few in a row.
@@ -154,6 +155,8 @@ def simulate(
         holds_more = _check_folder(out, request)
         if not holds_more:
             write(out / _MANIFEST, to_json(request))
+        classes = "".join(f"{int(one)}: {one.name.lower()}\n" for one in Semantic)
+        write(out / _CLASSES, classes.encode())
         tasks = []
         for drive, count in files.items():
             missing, simulator = drive.missing(count), simulators[drive.drive]

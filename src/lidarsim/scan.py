@@ -133,9 +133,20 @@ class Simulator:
         sensor: str | SpinningLidar = "hdl64e",
         effects: Mapping[str, str | bool] | None = None,
     ) -> None:
+        if isinstance(weather, Mapping):
+            arguments = ", ".join(f"{name}={value}" for name, value in weather.items())
+            raise ValueError(f"weather must be an object such as Weather({arguments}), got a dict")
         self.street = Street(seed, drive, weather)
         self.sensor = load_sensor(sensor) if isinstance(sensor, str) else sensor
         self.switches = check_switches(effects or {})
+
+    def __repr__(self) -> str:
+        street = self.street
+        weather = street.weather or "drawn"
+        return (
+            f"Simulator(seed={street.seed}, drive={street.drive}, weather={weather}, "
+            f"{len(self.sensor.lasers.inclination_rad)} beams)"
+        )
 
     def scan(self, number: int) -> SimulatedScan:
         """Scan ``number`` of the drive, 0 or greater; neighbours are 0.1 s apart."""

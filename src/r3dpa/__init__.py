@@ -32,7 +32,12 @@ _MODULES = {
 
 
 def __getattr__(name: str) -> Any:
-    """Imports a public class on first use: torch takes seconds."""
+    """Import a public class on first use: torch takes seconds."""
     if name not in _MODULES:
         raise AttributeError(f"module 'r3dpa' has no attribute {name!r}")
     return getattr(import_module(_MODULES[name]), name)
+
+
+def __dir__() -> list[str]:
+    """Names to complete after ``r3dpa.``, without importing them."""
+    return sorted(__all__)

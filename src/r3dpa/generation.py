@@ -247,6 +247,8 @@ class SceneGenerator:
 
     def with_sampler(self, sampler: SamplerConfig) -> SceneGenerator:
         """The same networks, compiled where these are, with another solver; both may be used."""
+        if not isinstance(sampler, SamplerConfig):
+            raise ValueError(f"sampler must be a SamplerConfig, got {sampler!r}")
         _check_average(sampler, self.sit, self._autoguidance)
         other = copy.copy(self)
         other._strong, other._weak = copy.copy(self._strong), copy.copy(self._weak)
@@ -432,6 +434,8 @@ def scene_indices(indices: int | Sequence[int]) -> Sequence[int]:
     Raises:
         ValueError: If there is none.
     """
+    if isinstance(indices, bool | str | float):
+        raise ValueError(f"give a number of scenes or their indices, got {indices!r}")
     numbers = range(int(indices)) if isinstance(indices, int | np.integer) else indices
     if len(numbers) == 0:
         raise ValueError("no scene is requested: give a number of at least 1, or indices")

@@ -93,7 +93,7 @@ def models(name: str | None = None) -> str:
         ]
         return text_table(rows, ["name", "size", "card"], "lrl", "plain")
     if name not in known:
-        raise ValueError(f"there are no weights {name!r}; there are {', '.join(known) or 'none'}")
+        raise ValueError(f"unknown weights '{name}'; choose from {', '.join(known) or 'none'}")
     return known[name].card.read_text()
 
 

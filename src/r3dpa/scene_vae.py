@@ -79,17 +79,50 @@ class SceneVAE:
             points: ``(P, 3)`` in metres, or ``(P, 4)`` with the intensity, which some VAEs need.
             labels: ``(P,)`` KITTI-360 class in the lower 16 bits, for a VAE of classes; without,
                 it sees returns of no class, which it has hardly been trained on.
+
+        Raises:
+            ValueError: If the points are no array of points, not finite, or all out of range.
         """
-        given = torch.as_tensor(points).float()
+        given = self._checked_points(points)
         known = None if labels is None else torch.from_numpy(np.asarray(labels, dtype=np.int64))
         pixels = project_pixels(given, self.geometry.projection, known)
         image = self.geometry.codec.to_image(*pixels).to(self.device)
         return self.vae.encode(image[None]).mean
 
     @torch.no_grad()
-    def decode(self, latents: Tensor) -> SceneBatch:
-        """Scenes of raw latents ``(B, C, h, w)``, with what the VAE has of intensity and labels."""
+    def decode(self, latents: Tensor | np.ndarray) -> SceneBatch:
+        """Scenes of raw latents ``(B, C, h, w)``, with what the VAE has of intensity and labels.
+
+        Raises:
+            ValueError: If the latents have another shape than those of the VAE.
+        """
         projection = self.geometry.projection
+        sensor = projection.sensor
+        size = self.vae.latent_channels, *self.vae.latent_size((sensor.beams, sensor.columns))
+        latents = torch.as_tensor(latents, device=next(self.vae.parameters()).device)
+        if latents.ndim != 4 or latents.shape[1:] != size:
+            raise ValueError(f"latents must have shape (B, *{size}), got {tuple(latents.shape)}")
         image = self.vae.decode(latents).float()
         pixels = self.geometry.codec.pixels_of(image, projection.sensor)
         return SceneBatch.of(pixels, latents, 0, projection)
+
+    def _checked_points(self, points: Tensor | np.ndarray) -> Tensor:
+        """Points as a tensor of float32; refuses what is no scan in metres."""
+        if not isinstance(points, Tensor | np.ndarray):
+            raise ValueError(
+                f"points must be an array or tensor (P, 3) or (P, 4), got {type(points).__name__}; "
+                "r3dpa.data.read_scan reads them from a file"
+            )
+        given = torch.as_tensor(points).float()
+        if given.ndim != 2 or given.shape[1] not in (3, 4):
+            raise ValueError(f"points must be (P, 3) or (P, 4), got shape {tuple(given.shape)}")
+        if not given.isfinite().all():
+            raise ValueError("points must be finite: leave out those with NaN or infinity")
+        sensor = self.geometry.projection.sensor
+        distance_m = given[:, :3].norm(dim=1)
+        if not ((distance_m >= sensor.range_min_m) & (distance_m <= sensor.range_max_m)).any():
+            raise ValueError(
+                f"none of {len(given)} points lies {sensor.range_min_m:g} to "
+                f"{sensor.range_max_m:g} m from the sensor; coordinates must be in metres"
+            )
+        return given

@@ -30,7 +30,7 @@ def commands_in(text):
     for line in text.replace("\\\n", " ").splitlines():
         found = re.match(r"[\s$!]*r3dpa (?!COMMAND)(.+)", line)
         if found:
-            words = shlex.split(found[1], comments=True)
+            words = shlex.split(found[1].partition(" > ")[0], comments=True)
             if "..." not in words and not any("|" in word for word in words):
                 yield words
 

@@ -139,8 +139,8 @@ class TestForms:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--data", "no/folder"], "--data no/folder: is no folder of scans and no data YAML"),
-        (["--data", "{scans}"], "there is no extractor: give --extractor, one of scalr, "),
+        (["--data", "no/folder"], "--data no/folder: no such folder of scans or data YAML"),
+        (["--data", "{scans}"], "no feature extractor: give --extractor, one of scalr, "),
         (["--data", "{scans}", "--ckpt", "no.pth"], "no.pth: no such file; give ckpt_last.pth"),
         (
             ["--data", "{yaml}", "--trainer.precision", "16-true"],

@@ -153,7 +153,7 @@ def test_a_teacher_is_moved_to_the_images():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({}, "give model.init_from a checkpoint of stage image_vae"),
+        ({}, "give --model.init_args.init_from a checkpoint of stage image_vae"),
         ({"model.init_args.weights.sit_alignment": 0.5}, "go together"),
         ({"data.init_args.image_size": 32}, r"give \(16, 16\) latents"),
     ],

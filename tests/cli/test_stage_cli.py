@@ -13,7 +13,8 @@ from lightning.pytorch.demos.boring_classes import BoringModel
 
 from r3dpa.cli import main
 from r3dpa.cli.features import with_data_class
-from r3dpa.cli.stages import conf_folder, ignore_harmless_warnings
+from r3dpa.cli.presets import conf_folder
+from r3dpa.cli.stages import ignore_harmless_notices
 from r3dpa.features import feature_source
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
@@ -40,7 +41,7 @@ def test_means_of_all_processes_need_no_advice(name, shown):
     advice = f"It is recommended to use `self.log({name!r}, ..., sync_dist=True)` when logging on"
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
-        ignore_harmless_warnings()
+        ignore_harmless_notices()
         warnings.warn(advice, stacklevel=1)
     assert len(found) == shown
 
@@ -80,7 +81,7 @@ def test_a_stage_of_range_images_needs_batches_of_them(smoke_args, tmp_path):
     arguments = smoke_args("vae_alignment", tmp_path, *more)
     with pytest.raises(
         ValueError,
-        match=r"data\.class_path: VAEAlignment needs a data module that gives .*LidarBatch.*, "
+        match=r"--data\.class_path: VAEAlignment needs a data module that gives .*LidarBatch.*, "
         r"got BoringDataModule",
     ):
         main(arguments)
@@ -90,7 +91,11 @@ def test_a_stage_of_range_images_needs_batches_of_them(smoke_args, tmp_path):
 @pytest.mark.parametrize(
     ("model", "data", "message"),
     [
-        ("r3dpa.modules.Nothing", "BoringDataModule", "r3dpa fit: --model: .*r3dpa.modules.Noth"),
+        (
+            "r3dpa.modules.Nothing",
+            "BoringDataModule",
+            "r3dpa fit: --model: module .r3dpa.modules. has no attribute .Nothing",
+        ),
         (f"{BORING}.BoringModel", "BoringModel", "r3dpa fit: --data: .*BoringModel"),
     ],
 )
@@ -110,7 +115,9 @@ def test_presets_are_the_shipped_configurations(capsys, tmp_path, monkeypatch):
     assert config["model"]["init_args"]["sit"]["init_args"]["hidden_size"] == 192
     assert config["data"]["init_args"]["root"] == "runs/demo/data"
     assert (config["run_dir"], config["trainer"]["max_steps"]) == ("runs/demo/joint", 7)
-    with pytest.raises(ValueError, match=r"there is no data 'kitti'; give one of .*kitti360"):
+    with pytest.raises(
+        ValueError, match=r"unknown preset 'kitti' .did you mean kitti360.*; choose from .*kitti360"
+    ):
         main(["fit", "joint", "--preset", "kitti"])
 
 

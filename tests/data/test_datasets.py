@@ -134,7 +134,7 @@ def test_posteriors_turn_with_the_scan(tmp_path, make_scans, projection):
 @pytest.mark.parametrize(
     ("augmentation", "latent_columns", "message"),
     [
-        (Augmentation(flip=True), 16, "flip: .*mirroring.*cache_latents: false"),
+        (Augmentation(flip=True), 16, "flip: .*mirroring.*--model.init_args.cache_latents false"),
         (Augmentation(rotate=True), 4, "rotate: 8 grid columns do not divide the 4 columns"),
         (Augmentation(rotate=True), 16, None),
         (Augmentation(), 4, None),

@@ -57,7 +57,7 @@ def test_layout_and_contents(tmp_path):
     assert (manifest["effects"], manifest["weather"]) == ({}, None)
     assert json.loads((tmp_path / "report.json").read_text()) == report.to_dict()
     top = {path.name for path in tmp_path.iterdir()}
-    assert top == {"data_3d_raw", "data_poses", "simulation.json", "report.json"}
+    assert top == {"data_3d_raw", "data_poses", "simulation.json", "classes.yaml", "report.json"}
 
 
 def test_files_of_a_scan_say_what_was_simulated(tmp_path):
@@ -131,7 +131,8 @@ def test_points_are_the_last_file_of_a_scan(tmp_path, monkeypatch):
         drive_files, "write", lambda path, content: (written.append(path), write(path, content))
     )
     simulate(tmp_path, 1, **SMALL)
-    assert [path.parent.name for path in written[:4]] == ["labels", "origins", "sim", "data"]
+    kinds = [path.parent.name for path in written[:5]]
+    assert kinds == ["boxes", "labels", "origins", "sim", "data"]
 
 
 def test_another_request_is_refused_with_both_values(tmp_path):

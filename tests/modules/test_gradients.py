@@ -164,7 +164,10 @@ class TestNonFiniteGradients:
         ({"precision": "16-true"}, "precision 16-true is not supported"),
         ({"precision": "64-true"}, "precision 64-true is not supported"),
         ({"reload_dataloaders_every_n_epochs": 1}, "would break the order of a resumed run"),
-        ({"callbacks": [StochasticWeightAveraging(0.1)]}, "is not supported.*model.ema_decay"),
+        (
+            {"callbacks": [StochasticWeightAveraging(0.1)]},
+            "is not supported.*init_args.ema_decay",
+        ),
         (CLIP_BY_VALUE, "by norm per network; .*got 'value'"),
     ],
 )

@@ -152,7 +152,7 @@ def test_the_shipped_weights_start_a_vae_with_intensity_and_class():
 def test_images_of_another_codec_are_refused():
     vae = range_module(2, labelled=True).vae
     check_image(vae, LabelledData.codec)
-    with pytest.raises(ValueError, match=r"num_classes 15, but data\.codec gives channels 2"):
+    with pytest.raises(ValueError, match=r"num_classes 15, but --data.* gives channels 2"):
         check_image(vae, RangeData.codec)
 
 

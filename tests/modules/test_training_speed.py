@@ -83,7 +83,7 @@ class TestCachedLatents:
     def test_mirrored_scans_are_refused_at_once(self, smoke_args, vae_checkpoint, tmp_path):
         more = [*QUICK, "--model.init_args.init_from", str(vae_checkpoint)]
         more += ["--data.init_args.augmentation.flip=true"]
-        with pytest.raises(ValueError, match=r"mirroring.*cache_latents: false"):
+        with pytest.raises(ValueError, match=r"mirroring.*--model.init_args.cache_latents false"):
             main(smoke_args("flow_matching", tmp_path, *more))
 
 

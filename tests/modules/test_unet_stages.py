@@ -75,5 +75,5 @@ def test_a_scene_does_not_depend_on_its_batch(joint_checkpoint):
 def test_rgb_weights_are_for_a_sit(smoke_args, unet_file, joint_checkpoint, tmp_path):
     more = ["--model.init_args.sit", str(unet_file), "--trainer.logger=false"]
     more += ["--model.init_args.rgb_weights", str(joint_checkpoint)]
-    with pytest.raises(ValueError, match=r"rgb_weights start a SiT, but model\.sit is a UNet"):
+    with pytest.raises(ValueError, match=r"rgb_weights start a SiT, but the network is a UNet"):
         main(smoke_args("joint", tmp_path, *more))

@@ -126,8 +126,9 @@ class LiDM(Baseline):
             return
         if self.init_from is None:
             raise ValueError(
-                "stage lidm trains on the latents of a trained autoencoder: give model.init_from "
-                "a checkpoint of stage lidm_first_stage, or a converted one of LiDM"
+                "stage lidm trains on the latents of a trained autoencoder: give "
+                "--model.init_args.init_from a checkpoint of stage lidm_first_stage, or a "
+                "converted one of LiDM"
             )
         before = read_checkpoint(self.init_from)
         name = "first_stage" if "first_stage" in before.networks else "network"

@@ -64,8 +64,8 @@ class EMASnapshots(L.Callback):
             self._due = frozenset(max(1, round(f * trainer.max_steps)) for f in self.fractions)
         else:
             raise ValueError(
-                f"EMASnapshots needs to know the length of the training, but trainer.max_steps is "
-                f"{trainer.max_steps}: set it, or give the callback steps"
+                "EMASnapshots needs to know the length of the training, but --trainer.max_steps "
+                f"is {trainer.max_steps}: set it, or give the callback steps"
             )
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:

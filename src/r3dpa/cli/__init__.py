@@ -10,7 +10,7 @@ __all__ = ["COMMANDS", "main"]
 
 
 class Command(NamedTuple):
-    """Function ``file:name`` below ``r3dpa.cli``, or of another area, and summary for the help.
+    """Function ``file:name`` below ``r3dpa.cli``, or of another module, and summary for the help.
 
     jsonargparse reads the function: its arguments are the options, its docstring is the help, and
     what it returns is printed. Those of :data:`OWN_PARSER` take the words of the command line. A
@@ -23,19 +23,19 @@ class Command(NamedTuple):
 
 
 COMMANDS = {
-    "fit": Command("stages:run", "train a stage: r3dpa fit joint --preset demo"),
-    "validate": Command("stages:run", "evaluate on the validation split"),
-    "test": Command("stages:run", "sample scenes and compare them with real scans"),
-    "predict": Command("stages:run", "reconstruct scans with a checkpoint"),
+    "fit": Command("fit:run", "train a stage: r3dpa fit joint --preset demo"),
+    "validate": Command("fit:run", "evaluate on the validation split"),
+    "test": Command("fit:run", "sample scenes and compare them with real scans"),
+    "predict": Command("fit:run", "reconstruct scans with a checkpoint"),
     "data simulate": Command("lidarsim:simulate", "write simulated scans", True),
     "data check": Command("data:check", "list bad scans and missing folders of a data set"),
     "data convert": Command("lidarsim.conversion:convert", "write scans in another format"),
     "data view": Command("data:view", "draw scans: pictures and a page with point clouds"),
-    "data features": Command("features:features", "write feature grids of scans", resumable=True),
+    "data features": Command("fit:features", "write feature grids of scans", resumable=True),
     "data objects": Command("data:objects", "write mean features of object classes for inpaint"),
     "data reference": Command("evaluate:reference", "write statistics of real scans", True),
-    "data weather": Command("weather:weather", "put your scans into fog, rain, snow, sun", True),
-    "data corrupt": Command("weather:corrupt", "give your scans faults of the sensor", True),
+    "data weather": Command("weather:weather", "simulate weather on recorded scans", True),
+    "data corrupt": Command("weather:corrupt", "add sensor faults to recorded scans", True),
     "data realism": Command("evaluate:realism", "compare simulated scans with real ones"),
     "sample": Command("sample:sample", "generate scenes from a checkpoint", resumable=True),
     "gallery": Command("gallery:gallery", "write a page of scenes, nearest scans and edits"),
@@ -52,11 +52,16 @@ COMMANDS = {
     "ablate": Command("bench:ablate", "train and compare the paper's ablations", resumable=True),
     "bench sampling": Command("bench:sampling", "measure accuracy against sampling time", True),
     "bench training": Command("bench:training", "measure time and memory of training steps"),
+    "completion": Command("completion:completion", "print a script that completes in bash"),
 }
-OWN_PARSER = ("stages:run", "features:features")
+OWN_PARSER = ("fit:run", "fit:features")
 # Commands of `data` and `edit` are known by their own name, too: `r3dpa view` is `r3dpa data view`.
-_ALIASES = {name.split()[1]: name for name in COMMANDS if name.startswith(("data ", "edit "))}
-_GROUPS = tuple(dict.fromkeys(name.split()[0] for name in COMMANDS if " " in name))
+ALIASES = {
+    name.split()[1]: name
+    for name in COMMANDS
+    if name.startswith(("data ", "edit ")) and name.split()[1] not in COMMANDS
+}
+GROUPS = tuple(dict.fromkeys(name.split()[0] for name in COMMANDS if " " in name))
 
 
 def _help(group: str) -> str:
@@ -70,11 +75,15 @@ def _help(group: str) -> str:
 
 
 def _find(args: list[str]) -> tuple[str, list[str]]:
-    name = " ".join(args[: 2 if args[0] in _GROUPS else 1])
+    name = " ".join(args[: 2 if args[0] in GROUPS else 1])
     rest = args[len(name.split()) :]
-    name = name if name in COMMANDS else _ALIASES.get(name, name)
+    name = ALIASES.get(name, name)
     if name not in COMMANDS:
-        sys.stderr.write(f"r3dpa: unknown command {name!r}: give one of {', '.join(COMMANDS)}\n")
+        from r3dpa.cli.messages import suggestion
+
+        near = suggestion(name, [*COMMANDS, *ALIASES])
+        hint = near or f"; choose from {', '.join(COMMANDS)}"
+        sys.stderr.write(f"r3dpa: unknown command '{name}'{hint}\n")
         sys.exit(2)
     return name, rest
 
@@ -85,7 +94,7 @@ def _run(args: list[str]) -> None:
 
         sys.stdout.write(f"{__version__}\n")
         return
-    group = args[0] if args and args[0] in _GROUPS else ""
+    group = args[0] if args and args[0] in GROUPS else ""
     rest = args[1:] if group else args
     if not rest or rest[0] in ("-h", "--help"):
         sys.stdout.write(f"{_help(group)}\n")
@@ -113,7 +122,7 @@ def _run(args: list[str]) -> None:
 
 
 def main(args: list[str] | None = None) -> None:
-    """Runs the command line.
+    """Run the command line.
 
     Args:
         args: Words after ``r3dpa``. Default: those of the process, with errors about files or
@@ -133,5 +142,5 @@ def main(args: list[str] | None = None) -> None:
         message = str(error)
         if message.startswith("Caught "):  # in a process of a data loader, with its traceback
             message = message.strip().splitlines()[-1].partition(": ")[2]
-        name = " ".join(args[: 2 if args[0] in _GROUPS else 1])
+        name = " ".join(args[: 2 if args[0] in GROUPS else 1])
         sys.exit(f"r3dpa {name}: {message}")

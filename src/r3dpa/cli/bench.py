@@ -39,7 +39,7 @@ def training(
         quick: The demo's networks.
     """
     from r3dpa.bench import training as bench
-    from r3dpa.cli.stages import conf_folder
+    from r3dpa.cli.presets import conf_folder
 
     check_file(out)
     settings = bench.StepSettings(batch_size, steps, precision, device, quick)
@@ -122,7 +122,7 @@ def ablate(
         budget_only: Print number and length of the trainings, and start nothing.
     """
     from r3dpa import ablation
-    from r3dpa.cli.stages import shipped
+    from r3dpa.cli.presets import shipped
     from r3dpa.io import only_writer
 
     tables = shipped(tables) if tables.is_dir() or tables.suffix else shipped(f"{tables}.yaml")

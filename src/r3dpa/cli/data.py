@@ -68,14 +68,15 @@ def view(
     Args:
         source: A scan of any format that can be read, a folder of scans, or a ``.npz`` of scans.
         out: Folder for the pictures and the page; default: ``view/<name of the source>``.
-        num: Scans to show at most, evenly spread over the folder.
+        num: Maximum number of scans, evenly spaced over the folder.
         columns: Columns of files without names, such as ``x,y,z,intensity,ring``; default: by the
             values.
     """
     from r3dpa import viz
-    from r3dpa.cli.scene_files import page_scans, write_page
+    from r3dpa.cli.scene_files import page_scans
     from r3dpa.data.scans import evenly
     from r3dpa.geometry import LidarSensor, SphericalProjection
+    from r3dpa.viz.scenes import write_page
 
     check_folder(out)
     readers = page_scans(source, columns)
@@ -107,16 +108,15 @@ def objects(
     Args:
         data: Folder, file or glob of scans with labels beside them: of ``r3dpa data simulate``,
             KITTI-360 or SemanticKITTI.
-        ckpt: Checkpoint of the model that the objects are for; gives feature source, its width,
-            sensor and grid.
+        ckpt: Checkpoint to edit with; its feature source, sensor and grid are used.
         out: File to write, ``.safetensors``.
         features_ckpt: Weights of the feature source, if it has none of its own.
-        limit: Number of scans at most, evenly spread.
+        limit: Maximum number of scans, evenly spaced.
         device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
     """
     check_file(out)
     if out.suffix != ".safetensors":
-        raise ValueError(f"the library is a .safetensors file, got {out}")
+        raise ValueError(f"--out must be a .safetensors file, got {out}")
     check_features(ckpt)
     from tqdm import tqdm
 

@@ -21,7 +21,7 @@ from lidarsim.scan_files import out_of_range, read_clouds
 from r3dpa import viz
 from r3dpa.checkpoints import read_checkpoint
 from r3dpa.cli.parser import EditOptions
-from r3dpa.cli.scene_files import draw_scene, feature_source_of, provenance
+from r3dpa.cli.scene_files import feature_source_of, provenance
 from r3dpa.data import PointSample, Scan, ScanError, pooled_grids
 from r3dpa.data.images import read_mask
 from r3dpa.data.scene_writer import SceneWriter
@@ -36,6 +36,7 @@ from r3dpa.io import atomic_path, usable_device, write_text
 from r3dpa.nn import VelocityNetwork
 from r3dpa.scenes import SceneBatch
 from r3dpa.stages import BASELINE_STAGES, scene_generator
+from r3dpa.viz.scenes import draw_scene
 
 _SHOWN = 8  # results on the sheet and the page
 

@@ -11,7 +11,8 @@ from typing import Any, cast
 
 from lightning import Trainer
 
-from r3dpa.cli.stages import StageParser, ignore_harmless_warnings, shipped
+from r3dpa.cli.presets import shipped
+from r3dpa.cli.stages import StageParser, ignore_harmless_notices
 from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.data.feature_grids import features_lock, plan
 from r3dpa.data.scans import Scan
@@ -22,8 +23,8 @@ from r3dpa.modules.stage import check_trainer
 
 
 def features(args: list[str]) -> None:
-    """Runs the command with its name and the words after it."""
-    ignore_harmless_warnings()
+    """Run the command, given its name and the words after it."""
+    ignore_harmless_notices()
     parser = features_parser("r3dpa data features")
     config = parser.parse_args(with_data_class(args[1:]))
     if config.extractor or config.ckpt:
@@ -36,14 +37,14 @@ def features(args: list[str]) -> None:
     data: LidarDataModule = objects.data
     if data.extractor is None or data.features_dir is None:
         raise ValueError(
-            f"there is no extractor: give --extractor, one of {', '.join(SOURCES)}, or one in the "
-            "data configuration (data.init_args.extractor)"
+            f"no feature extractor: give --extractor, one of {', '.join(SOURCES)}, or one in the "
+            "data configuration (--data.init_args.extractor)"
         )
     _extract(data, trainer, config.grid_sizes or [data.grid_size])
 
 
 def _extract(data: LidarDataModule, trainer: Trainer, sizes: list[tuple[int, int]]) -> None:
-    # The data module finds its scans, or simulates them; it must not extract grids itself.
+    # The data module finds or simulates its scans; it must not extract grids itself.
     extractor, data.extractor = cast(Any, data.extractor), None
     folder = cast(Path, data.features_dir)
     projection: Projection | None = None
@@ -57,7 +58,7 @@ def _extract(data: LidarDataModule, trainer: Trainer, sizes: list[tuple[int, int
             arguments = data.all_set.scans, extractor, projection, sizes, folder, trainer.precision
             if plan(*arguments).missing:  # complete grids may lie on a read-only disk
                 job.enter_context(features_lock(folder))
-            todo = plan(*arguments)  # another job may have made some before the lock was free
+            todo = plan(*arguments)  # another job may have written some before the lock was free
             scans = list(todo.missing)
             stores = ", ".join(str(folder / f"{h}x{w}") for h, w in todo.stores)
             sys.stdout.write(
@@ -85,7 +86,10 @@ def _extract(data: LidarDataModule, trainer: Trainer, sizes: list[tuple[int, int
 
 
 def read_data(source: Path) -> LidarDataModule:
-    """Data module of a folder of scans or a data YAML, without features; simulates its scans."""
+    """Make the data module of a folder of scans or a data YAML, without features.
+
+    Simulates the scans of a data YAML where they are missing.
+    """
     parser = features_parser("r3dpa data reference")
     config = parser.parse_args(with_data_class(["--data", str(source)]))
     config.data.init_args.extractor = config.data.init_args.features_dir = None
@@ -96,31 +100,31 @@ def read_data(source: Path) -> LidarDataModule:
 
 
 def with_data_class(words: Sequence[str]) -> list[str]:
-    """The words with a folder or YAML file after ``--data`` as class path or ``--config``."""
-    found: list[str] = []
+    """Replace a folder or YAML file after ``--data`` by a class path or ``--config``."""
+    replaced: list[str] = []
     rest = iter(words)
     for word in rest:
         name, equals, value = word.partition("=")
         if name != "--data":
-            found.append(word)
+            replaced.append(word)
             continue
         value = value if equals else next(rest, "")
         source = Path(value)
         if (source / "data_3d_raw").is_dir():
-            found += ["--data=r3dpa.data.KITTI360DataModule", f"--data.init_args.root={value}"]
+            replaced += ["--data=r3dpa.data.KITTI360DataModule", f"--data.init_args.root={value}"]
         elif source.is_dir():
-            found += ["--data=r3dpa.data.LidarDataModule", f"--data.init_args.scans={value}"]
+            replaced += ["--data=r3dpa.data.LidarDataModule", f"--data.init_args.scans={value}"]
         elif source.suffix in (".yaml", ".yml"):
-            found += ["--config", str(shipped(value))]
+            replaced += ["--config", str(shipped(value))]
         elif len(source.parts) > 1:
-            raise ValueError(f"--data {value}: is no folder of scans and no data YAML")
+            raise ValueError(f"--data {value}: no such folder of scans or data YAML")
         else:  # a class
-            found += ["--data", value]
-    return found
+            replaced += ["--data", value]
+    return replaced
 
 
 def features_parser(prog: str) -> StageParser:
-    """Parser of the command, and of ``--data`` for another ``prog``."""
+    """Make the parser of the command, also used to read ``--data`` for another ``prog``."""
     parser = StageParser(
         prog=prog,
         description="Write the feature grids of all scans of --data: a folder of scans, in the "

@@ -1,13 +1,12 @@
-"""Parsers with one-line errors, and lists as words; options that several commands share."""
+"""Parser of a command from the function that does the work; options that commands share."""
 
 from __future__ import annotations
 
 import argparse
 import json
-import re
 import sys
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, is_dataclass
 from importlib import import_module
 from inspect import cleandoc
 from pathlib import Path
@@ -17,6 +16,7 @@ from typing import Any, Literal, NoReturn, Union, cast, get_args, get_origin
 import yaml
 from jsonargparse import (
     ArgumentParser,
+    DefaultHelpFormatter,
     Namespace,
     get_loader,
     set_loader,
@@ -25,15 +25,15 @@ from jsonargparse import (
 from jsonargparse.typing import NonNegativeInt, PositiveInt
 
 from r3dpa.class_paths import current_path, with_current_paths
-from r3dpa.pretrained import DEFAULT_WEIGHTS
+from r3dpa.cli.messages import ALLOWED_PACKAGES, describe_error
+from r3dpa.pretrained import DEFAULT_WEIGHTS, weights_file
 
-# Packages whose classes a configuration may name. An argument of any type gets plain values alone:
-# the classes of other packages, and those that nothing restricts to a base, can start a shell.
-_ALLOWED = ("r3dpa", "lidarsim", "lightning", "torch.nn", "torch.optim")
+# An argument of any type gets plain values alone: the classes of other packages, and those that
+# nothing restricts to a base class, can start a shell.
 set_parsing_settings(
     instantiate_subclass_spec_in_any=False,
     import_path_denylist=["*"],
-    import_path_allowlist=list(_ALLOWED),
+    import_path_allowlist=list(ALLOWED_PACKAGES),
 )
 _load_yaml = get_loader("yaml")
 
@@ -43,61 +43,96 @@ def _load_yaml_of_any_version(text: str) -> Any:
 
 
 set_loader("yaml", _load_yaml_of_any_version, (yaml.YAMLError,))
-_DENIED = re.compile(r"Importing '([\w.]+)' is not allowed, .* set_parsing_settings to allow it")
+# One word for one thing in all commands; the function's own name is an option as well.
+_COMMON_NAMES = {"limit": "--num", "frames": "--num", "scenes": "--num", "jobs": "--workers"}
+# Files and folders that must exist: options, and words without one.
+_INPUT_OPTIONS = (
+    "scan",
+    "left",
+    "right",
+    "mask",
+    "objects",
+    "samples",
+    "reference",
+    "scans",
+    "data",
+)
+_INPUT_WORDS = ("source", "path", "run", "file")
+
+
+class HelpFormatter(DefaultHelpFormatter):
+    """Help without ``default: null``, which each text explains, and with plain type names."""
+
+    def _get_help_string(self, action: argparse.Action) -> str:
+        text = super()._get_help_string(action)
+        if action.default is None:
+            text = text.replace(", default: %(default)s", "")
+        return text
+
+    def _get_type_str(self, action: argparse.Action) -> str | None:
+        name = super()._get_type_str(action)
+        if name is None:
+            return None
+        if name.startswith("Optional["):
+            name = name[len("Optional[") : -1]
+        return name.removeprefix("<class '").removesuffix("'>").removesuffix(" | null")
 
 
 class Parser(ArgumentParser):
     """Parser with errors in one line; ``--quick`` stands for ``--quick true``."""
 
+    words: Sequence[str] = ()  # of the command line, for messages
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **{"formatter_class": HelpFormatter} | kwargs)
+
     def add_argument(self, *args: Any, **kwargs: Any) -> Any:
-        """Adds an argument; boolean ones need no value."""
+        """Add an argument; boolean ones need no value, and some have a second, common name."""
         if kwargs.get("type") is bool:
             kwargs |= {"nargs": "?", "const": True}
+        name = args[0].removeprefix("--")
+        is_count = name == "scans" and kwargs.get("type") is int  # elsewhere a folder
+        if args[0] != name and (name in _COMMON_NAMES or is_count):
+            args = ("--num" if is_count else _COMMON_NAMES[name], *args)
+            kwargs["dest"] = name
         return super().add_argument(*args, **kwargs)
 
     def parse_args(self, args: Any = None, *others: Any, **settings: Any) -> Any:
-        """Parses words, in which classes may have the import paths of earlier versions."""
+        """Parse words, in which classes may have the import paths of earlier versions."""
         words = []
         for word in sys.argv[1:] if args is None else args:
             name, equals, value = word.rpartition("=")  # --option=class or class
             words.append(f"{name}{equals}{current_path(value)}")
         return super().parse_args(words, *others, **settings)
 
+    def format_help(self, formatter: Any = None) -> str:
+        """Help of the options, and of the fields of each optional dataclass."""
+        texts = [super().format_help(formatter)]
+        for action in self._actions:
+            kinds = [k for k in get_args(getattr(action, "_typehint", None)) if k is not type(None)]
+            if len(kinds) == 1 and is_dataclass(kinds[0]) and not action.dest.endswith(".help"):
+                fields = ArgumentParser(add_help=False, formatter_class=HelpFormatter)
+                fields.add_class_arguments(kinds[0], action.dest)
+                texts.append(fields.format_help().partition("\n\n")[2])
+        return "\n".join(texts)
+
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
-        """Prints the message and exits with status 2; parsers of nested classes raise it."""
+        """Print the message and exit with status 2; parsers of nested classes raise it."""
         if not self.exit_on_error:
             super().error(message, ex)
         parser = getattr(ex, "subcommand_parser", None) or self
         prog = parser.prog.replace(" [options]", "")
-        sys.stderr.write(f"{prog}: {_short(message)}; see {prog} --help\n")
+        text = describe_error(message, ex, parser, self.words)
+        sys.stderr.write(f"{prog}: {text}; see {prog} --help\n")
         sys.exit(2)
 
 
-def _short(message: str) -> str:
-    """An error of jsonargparse in one line, without the types that a union tried."""
-    denied = _DENIED.search(message)
-    if denied is not None:
-        return (
-            f"{denied[1]} is not allowed: a configuration may name classes of "
-            f"{', '.join(_ALLOWED)}, and of a package of yours after --allow_import PACKAGE"
-        )
-    head, _, tail = message.partition("Does not validate against any of the Union subtypes")
-    causes = re.search(r"Errors:\s*(.*?)\s*Given value type:", tail, re.DOTALL)
-    if causes is not None:
-        found = re.split(r"(?:^|\s)- (?=[A-Z])", " ".join(causes[1].split()))
-        found = [c for c in found if c and "null" not in c and "Expected a path" not in c]
-        value = tail.rpartition("Given value: ")[2].strip()
-        message = f"{head}{found[0] if found else 'cannot be used'} (got {value})"
-    message = re.sub(r'Parser key "([^"]+)": ', r"--\1: ", " ".join(message.split()).rstrip("."))
-    return re.sub(r"Expected an? <class '(\w+)'>", r"expected \1", message)
-
-
-def _with_lists(parser: Parser, words: Sequence[str]) -> list[str]:
-    """The words, those of a list as one.
+def join_list_words(parser: Parser, words: Sequence[str]) -> list[str]:
+    """Write the words after each list option as one, as jsonargparse expects them.
 
     ``--box -10 10 -20 0``, ``--box -10,10,-20,0`` and ``--box '[-10, 10, -20, 0]'`` are the same.
     """
-    types = {
+    item_types = {
         name: _item_types(getattr(action, "_typehint", None))
         for action in parser._actions
         for name in action.option_strings
@@ -106,26 +141,34 @@ def _with_lists(parser: Parser, words: Sequence[str]) -> list[str]:
     rest = list(words)
     while rest:
         name, equals, value = rest[0].partition("=")
-        joined.append(rest.pop(0))
-        if not types.get(name):
+        if not item_types.get(name):
+            joined.append(rest.pop(0))
             continue
+        rest.pop(0)
         items = [value] if equals else []
-        while rest and not equals and re.match(r"[^-]|-\.?\d|$", rest[0]):  # no option
+        while rest and not equals and not _is_option(rest[0]):
             items.append(rest.pop(0))
         if items and not items[0].lstrip().startswith("["):
-            parts = [part.strip() for item in items for part in item.split(",")]
-            quoted = parts if types[name] <= {int, float} else map(json.dumps, parts)
-            items = [f"[{', '.join(quoted)}]"]
-        joined = [*joined[:-1], name, *items]
+            items = [part.strip() for item in items for part in item.split(",")]
+            if not item_types[name] <= {int, float}:
+                items = [json.dumps(item) for item in items]
+            items = [f"[{', '.join(items)}]"]
+        joined += [name, *items]
     return joined
+
+
+def _is_option(word: str) -> bool:
+    """Whether a word starts an option; a negative number does not."""
+    return word.startswith("-") and not word[1:].lstrip(".")[:1].isdigit()
 
 
 def _item_types(kind: Any) -> set[Any]:
     """Types of the items of a list or tuple, also of an optional one; empty for other types."""
     if get_origin(kind) in (list, tuple, Sequence):
         return set(get_args(kind))
-    union = get_origin(kind) in (Union, UnionType)
-    return set().union(*map(_item_types, get_args(kind))) if union else set()
+    if get_origin(kind) in (Union, UnionType):
+        return set[Any]().union(*(_item_types(member) for member in get_args(kind)))
+    return set()
 
 
 def allow_imports(words: Sequence[str]) -> list[str]:
@@ -141,16 +184,14 @@ def allow_imports(words: Sequence[str]) -> list[str]:
 
 
 def load(target: str) -> Callable[..., Any]:
-    """The function of ``file:name`` below ``r3dpa.cli``, or of ``package.module:name``."""
+    """Import the function of ``file:name`` below ``r3dpa.cli``, or of ``package.module:name``."""
     file, _, name = target.partition(":")
     module = import_module(file if file.startswith(("r3dpa.", "lidarsim")) else f"r3dpa.cli.{file}")
     return cast(Callable[..., Any], getattr(module, name))
 
 
-def parse(
-    function: Callable[..., Any], words: Sequence[str], prog: str
-) -> tuple[Parser, Namespace]:
-    """Parser of a function and the values of a command line.
+def make_parser(function: Callable[..., Any], prog: str | None = None) -> Parser:
+    """Make the parser of a function.
 
     Keyword-only arguments are options, and so are those of functions outside this package.
     """
@@ -159,11 +200,20 @@ def parse(
     parser = Parser(prog=prog, description=description)
     parser.add_argument("--config", action="config", help="YAML file with options")
     parser.add_function_arguments(function, as_positional=positional, as_group=False)
-    return parser, parser.parse_args(_with_lists(parser, words))
+    return parser
+
+
+def parse(
+    function: Callable[..., Any], words: Sequence[str], prog: str
+) -> tuple[Parser, Namespace]:
+    """Make the parser of a function, and parse a command line with it."""
+    parser = make_parser(function, prog)
+    parser.words = words
+    return parser, parser.parse_args(join_list_words(parser, words))
 
 
 def run_function(function: Callable[..., Any], words: Sequence[str], prog: str) -> Any:
-    """Calls a function with the arguments of a command line; returns its result."""
+    """Call a function with the arguments of a command line; return its result."""
     parser, config = parse(function, words, prog)
     try:
         arguments = parser.instantiate(config).as_dict()
@@ -172,7 +222,20 @@ def run_function(function: Callable[..., Any], words: Sequence[str], prog: str) 
             raise error.__cause__ from None
         raise
     arguments.pop("config", None)
+    _check_inputs(arguments)
     return function(**arguments)
+
+
+def _check_inputs(arguments: Mapping[str, Any]) -> None:
+    """Refuse files that do not exist, before torch is imported, which takes seconds."""
+    ckpt = arguments.get("ckpt")
+    if isinstance(ckpt, Path) and not str(ckpt).startswith("hf:/"):
+        weights_file(ckpt)
+    for name in (*_INPUT_WORDS, *_INPUT_OPTIONS):
+        path = arguments.get(name)
+        if isinstance(path, Path) and not path.exists():
+            option = f"--{name} " if name in _INPUT_OPTIONS else ""
+            raise ValueError(f"{option}{path}: no such file or folder")
 
 
 ODESolver = Literal["euler", "heun", "midpoint", "ab2", "ab3", "dpmpp_2m", "unipc"]
@@ -180,19 +243,19 @@ ODESolver = Literal["euler", "heun", "midpoint", "ab2", "ab3", "dpmpp_2m", "unip
 
 @dataclass(frozen=True, kw_only=True)
 class SceneOptions:
-    """Checkpoint that makes scenes, and files that they are written to.
+    """Checkpoint that generates scenes, and files that they are written to.
 
     Args:
         ckpt: Checkpoint of stage joint or flow_matching, ``.ckpt`` or exported ``.safetensors``, a
             name of ``r3dpa models``, or ``hf://owner/name``.
         out: Folder for scenes, pictures, page and metadata; must not hold other scenes.
         seed: Scene i depends on (seed, i) alone, not on the batch size.
-        batch_size: Scenes made together.
+        batch_size: Scenes generated together.
         device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
         weights: Averaged (``ema``) or last weights of the SiT.
         formats: Files of points: ``bin``, ``ply``, ``npz``; ``range_m.npy`` is always written.
         pictures: Number of scenes to draw.
-        overwrite: Write into a folder that holds scenes already, and start anew.
+        overwrite: Replace the scenes of a folder.
     """
 
     out: Path
@@ -211,11 +274,11 @@ class SceneOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class EditOptions(SceneOptions):
-    """Those of all edits.
+    """Options shared by all edits.
 
     Args:
-        solver: ODE solver, to noise and back; ``midpoint`` loses least on that way.
-        steps: Solver steps of a whole way.
+        solver: ODE solver, to noise and back; ``midpoint`` has the least error there and back.
+        steps: Solver steps from data to noise.
         shift: Finer steps near noise (above 1) or data (below 1).
     """
 
@@ -225,14 +288,14 @@ class EditOptions(SceneOptions):
 
 
 def check_folder(out: Path | None) -> None:
-    """Refuses an output folder whose place is taken by a file, before the work starts."""
+    """Refuse an output folder whose path is a file, before the work starts."""
     for folder in () if out is None else (out, *out.parents):
         if folder.is_file():
             raise ValueError(f"{folder} is a file; give another --out")
 
 
 def check_file(out: Path | None) -> None:
-    """Refuses an output file whose place is taken by a folder, before the work starts."""
+    """Refuse an output file whose path is a folder, before the work starts."""
     if out is not None and out.is_dir():
         raise ValueError(f"{out} is a folder; give --out the name of a file")
     check_folder(None if out is None else out.parent)

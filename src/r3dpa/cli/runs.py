@@ -30,10 +30,18 @@ def convert(
         networks: Write these alone; sampling needs ``vae ema ema_latent_norm``.
         half: Write weights in float16, half as large.
     """
-    arguments = dict(locals())
     from r3dpa.checkpoints import convert as convert_checkpoint
 
-    return convert_checkpoint(**arguments)
+    return convert_checkpoint(
+        source,
+        out,
+        to=to,
+        overwrite=overwrite,
+        sit_args=sit_args,
+        encoding=encoding,
+        networks=networks,
+        half=half,
+    )
 
 
 def report(run: Path) -> str:

@@ -29,10 +29,10 @@ def sample(
 ) -> str:
     """Generate scenes from a checkpoint: points, range images, pictures and a page to turn.
 
-    Where the checkpoint generates them, points have an intensity, and ``labels`` holds their
-    classes of KITTI-360. The same command completes an interrupted run; with a greater ``--num`` it
-    adds scenes. An option that the solver does not read is an error. ``metadata.json`` holds
-    everything needed to repeat the run.
+    Points have an intensity, and ``labels`` the classes of KITTI-360, where the checkpoint
+    generates them. The same command completes an interrupted run; with a greater ``--num`` it adds
+    scenes. Options that the solver does not read are refused. ``metadata.json`` holds everything
+    needed to repeat the run.
 
     Args:
         num: Number of scenes.
@@ -45,7 +45,7 @@ def sample(
         shift: Finer steps near noise (above 1) or data (below 1) of the ODE.
         eta: Noise strength of the SDE; default: 1, as published.
         sde_last: Last SDE step: ``denoise`` (default) or ``mean`` as in the official sampler.
-        autoguidance: Snapshot of a weaker model to be guided away from; doubles the evaluations.
+        autoguidance: Snapshot of a weaker model to guide away from; doubles the evaluations.
         guidance_scale: Strength of guidance, 1 for none; default: that of the weights, which are
             guided away from themselves without one attention map; 2 with ``--autoguidance``.
         guidance_interval: Times of autoguidance, such as ``0.2 0.8``; 0 is data, 1 noise; default:
@@ -56,20 +56,26 @@ def sample(
         compile: Compile the networks: a minute or more at first, then faster.
         **options: See :class:`SceneOptions`.
     """
-    arguments = dict(locals())
     from dataclasses import asdict
 
     from r3dpa.checkpoints import read_checkpoint, read_snapshot
-    from r3dpa.cli.scene_files import draw_all, generate_all, provenance, written
+    from r3dpa.cli.scene_files import generate_all, provenance, written
     from r3dpa.data.scene_writer import SceneWriter
     from r3dpa.flow.sampler import Quality
     from r3dpa.generation import Autoguidance, SamplerConfig
     from r3dpa.io import usable_device
     from r3dpa.nn import ThinDecoder
     from r3dpa.stages import BASELINE_STAGES, published_sampler, scene_generator
+    from r3dpa.viz.scenes import draw_scenes
 
-    of_solver = ("solver", "steps", "shift", "eta", "sde_last")
-    given = {name: arguments[name] for name in of_solver if arguments[name] is not None}
+    settings: dict[str, Any] = {
+        "solver": solver,
+        "steps": steps,
+        "shift": shift,
+        "eta": eta,
+        "sde_last": sde_last,
+    }
+    given = {name: value for name, value in settings.items() if value is not None}
     if autoguidance is None and guidance_interval:
         raise ValueError("--guidance_interval needs --autoguidance")
     files = SceneOptions(**options)
@@ -117,11 +123,11 @@ def sample(
     projection = generator.geometry.projection
     with SceneWriter(files.out, num, projection, files.formats, request, files.overwrite) as writer:
         measured = generate_all(generator, writer, files.batch_size, files.seed)
-        opened = draw_all(files.out, writer.range_path, files.pictures, generator.geometry)
+        opened = draw_scenes(files.out, writer.range_path, files.pictures, generator.geometry)
         writer.finish(request | measured)
     line = f"{num} scenes in {files.out}: {measured['nfe']:.5g} network evaluations each"
     if measured["drawn_by_last_run"]:
-        line += f", {measured['seconds_per_scene']:.3g} s a scene"
+        line += f", {measured['seconds_per_scene']:.3g} s per scene"
     note = f"sampler: {generator.sampler.summary}"
     if not given and generator.sampler == SamplerConfig.of_quality(quality or "good"):
         note = SamplerConfig.quality_line(quality or "good")  # measured, unlike a baseline's

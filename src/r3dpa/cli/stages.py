@@ -2,30 +2,34 @@
 
 from __future__ import annotations
 
+import logging
+import os
 import sys
 import uuid
 import warnings
 from collections.abc import Sequence
 from contextlib import nullcontext
-from importlib.resources import files
 from pathlib import Path
 from typing import Any, cast
 
 import yaml
 from lightning import LightningDataModule, LightningModule, Trainer
+from lightning.pytorch.callbacks import TQDMProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
-from lightning.pytorch.loggers import WandbLogger
-from lightning.pytorch.utilities import rank_zero_only
+from lightning.pytorch.loggers import Logger, WandbLogger
+from lightning.pytorch.utilities import rank_zero_info, rank_zero_only
 
 from r3dpa.callbacks import RunCheckpoint, SceneScorer
+from r3dpa.callbacks.loss_bar import LossBar
 from r3dpa.checkpoints import read_checkpoint
 from r3dpa.cli.parser import Parser
+from r3dpa.cli.presets import expand_preset, find_configs
 from r3dpa.io import delete_unfinished, only_writer, source_commit, write_text
 from r3dpa.modules import GenerativeModule
 
-_STAGES = ("experiment", "baseline")  # folders of their configurations
-# Intended here: averages and frozen networks stay in evaluation mode, feature grids go to disk, a
-# process may have no scan, and the means of held-out scans are already those of all processes.
+# What a user can do nothing about, or what is intended: averages and frozen networks stay in
+# evaluation mode, feature grids go to disk, a process may have no scan, the means of held-out scans
+# are already those of all processes, and a stage's name stands for words that are not typed.
 _HARMLESS = (
     r"Found \d+ module\(s\) in eval mode",
     r"`isinstance\(treespec, LeafSpec\)` is deprecated",
@@ -35,42 +39,47 @@ _HARMLESS = (
     r"It is recommended to use `self\.log\('(val|test)/.*', \.\.\., sync_dist=True\)`",
     r"You have overridden `transfer_batch_to_device`",
     r"Total length of .* across ranks is zero",
+    r"LightningCLI's args parameter is intended to run from within Python",
 )
+
+
+_NOTICES = ("GPU available: False", "TPU available:", "HPU available:", "💡 Tip:", "Seed set to")
+_NOTICE_LOGGERS = ("lightning.pytorch.utilities.rank_zero", "lightning.fabric.utilities.seed")
+# What to do after a stage: the command that takes its checkpoint.
+_NEXT_COMMANDS = {
+    "image_vae": "fit rgb_pretraining{preset} --model.init_args.init_from {ckpt}",
+    "rgb_pretraining": "fit vae_alignment{preset} --model.init_args.rgb_weights {ckpt}",
+    "vae_alignment": "fit joint{preset} --model.init_args.init_from {ckpt}",
+    "lidm_first_stage": "fit lidm{preset} --model.init_args.init_from {ckpt}",
+}
+_SAMPLE_COMMAND = "sample --ckpt {ckpt} --out {run_dir}/scenes"
+# What a stage is without the weights that it starts from: enough to try it.
+_WITHOUT_WEIGHTS = {
+    "vae_alignment": (
+        "rgb_weights",
+        "the frozen SiT is random, which is enough to try the stage, not for the paper's numbers",
+    ),
+    "joint": (
+        "init_from",
+        "VAE and SiT start from random values; the paper starts from a checkpoint of vae_alignment",
+    ),
+}
 
 
 class StageParser(Parser, LightningArgumentParser):
     """Parser of stages and data modules."""
 
 
-def ignore_harmless_warnings() -> None:
-    """Hides warnings of Lightning about what is intended here."""
+def ignore_harmless_notices() -> None:
+    """Hide warnings and notices of Lightning about what is intended, or cannot be changed."""
     for message in _HARMLESS:
         warnings.filterwarnings("ignore", message=message)
+    for name in _NOTICE_LOGGERS:
+        logging.getLogger(name).addFilter(_is_useful)
 
 
-def conf_folder() -> Path:
-    """Folder of the shipped configurations, in a checkout and in an installed package alike."""
-    return Path(str(files("r3dpa") / "conf"))
-
-
-def shipped(path: str | Path) -> Path:
-    """The file, or the one of the package where ``conf/...`` does not exist here."""
-    of_package = conf_folder().parent / path
-    is_shipped = not Path(path).exists() and of_package.exists()
-    return of_package if is_shipped else Path(path)
-
-
-def _with_shipped(words: Sequence[str]) -> list[str]:
-    """The words with the files after ``--config`` as :func:`shipped` finds them."""
-    found: list[str] = []
-    for word in words:
-        name, _, value = word.partition("=")
-        if name == "--config" and value.startswith("conf/"):
-            word = f"--config={shipped(value)}"
-        elif found[-1:] == ["--config"] and word.startswith("conf/"):
-            word = str(shipped(word))
-        found.append(word)
-    return found
+def _is_useful(record: logging.LogRecord) -> bool:
+    return not record.getMessage().startswith(_NOTICES)
 
 
 def _prefer_whole_numbers(parser: LightningArgumentParser) -> None:
@@ -86,22 +95,42 @@ def _prefer_whole_numbers(parser: LightningArgumentParser) -> None:
 
 
 class _RecordConfig(SaveConfigCallback):
-    """Writes the configuration of a training to ``run_dir`` and to wandb."""
+    """Write the configuration of a training to ``run_dir`` and to wandb.
+
+    A wandb run begins with the first step: what data, networks and earlier checkpoints refuse
+    before that leaves no run behind.
+    """
 
     started = False
+    loggers: Sequence[Logger] = ()
+
+    def hold_wandb_back(self, trainer: Trainer) -> None:
+        """Take the wandb loggers out of a trainer until :meth:`on_train_start`."""
+        self.loggers = list(trainer.loggers)
+        trainer.loggers = [one for one in self.loggers if not isinstance(one, WandbLogger)]
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         if stage == "fit":  # evaluating a run does not replace its configuration
             super().setup(trainer, pl_module, stage)
 
     def save_config(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Not to ``trainer.log_dir``, which would need all processes."""
+        """Write the configuration; not to ``trainer.log_dir``, which would need all processes."""
         text = self.parser.dump(self.config, skip_unset=False, skip_validation=True)
+        write_text(Path(trainer.default_root_dir) / self.config_filename, text)
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Give the wandb loggers back, with the arguments of the module and the configuration."""
+        if not self.loggers:
+            return
+        trainer.loggers = list(self.loggers)
+        arguments = {k: v for k, v in pl_module.hparams_initial.items() if k != "_class_path"}
         path = Path(trainer.default_root_dir) / self.config_filename
-        write_text(path, text)
         for logger in trainer.loggers:
-            if isinstance(logger, WandbLogger):
-                logger.log_hyperparams(yaml.safe_load(text) | {"commit": source_commit()})
+            if isinstance(logger, WandbLogger) and trainer.is_global_zero:
+                logger._wandb_init.pop("anonymous", None)  # wandb warns of it, even if it is None
+                config = yaml.safe_load(path.read_text(encoding="utf-8"))
+                logger.log_hyperparams(arguments)
+                logger.log_hyperparams(config | {"commit": source_commit()})
 
     def on_train_batch_start(self, *_: Any) -> None:
         self.started = True
@@ -109,7 +138,7 @@ class _RecordConfig(SaveConfigCallback):
     def on_exception(
         self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
     ) -> None:
-        """Marks errors of a running training, whose traceback ``cli.main`` shows."""
+        """Mark errors of a running training, whose traceback ``cli.main`` shows."""
         exception.during_training = self.started  # type: ignore[attr-defined]
 
 
@@ -121,8 +150,8 @@ class StageCLI(LightningCLI):
     resumes a job.
     """
 
-    def __init__(self, args: list[str]) -> None:
-        self._command = args[0]
+    def __init__(self, args: list[str], preset: str | None = None) -> None:
+        self._command, self._preset = args[0], preset
         self._ckpt_step: int | None = None
         super().__init__(
             LightningModule,
@@ -139,11 +168,11 @@ class StageCLI(LightningCLI):
         )
 
     def subcommands(self) -> dict[str, set[str]]:  # type: ignore[override] # static there
-        """The given one alone: each has a parser that takes a quarter of a second to build."""
+        """Return the given one alone: each has a parser that takes a quarter of a second."""
         return {self._command: LightningCLI.subcommands()[self._command]}
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
-        """Adds ``run_dir``, the checkpoint callback that follows it, and the one that scores."""
+        """Add ``run_dir``, the checkpoint callback that follows it, and the one that scores."""
         _prefer_whole_numbers(parser)
         parser.add_argument(
             "--run_dir", type=str, default="runs/default", help="folder that the run writes to"
@@ -156,8 +185,15 @@ class StageCLI(LightningCLI):
             "run_dir", "checkpoint.dirpath", compute_fn=lambda run_dir: f"{run_dir}/checkpoints"
         )
 
+    def instantiate_trainer(self, **kwargs: Any) -> Trainer:
+        """Show losses in the bar; record the configuration before other callbacks start."""
+        trainer: Any = super().instantiate_trainer(**kwargs)
+        callbacks = [LossBar() if type(c) is TQDMProgressBar else c for c in trainer.callbacks]
+        trainer.callbacks = sorted(callbacks, key=lambda c: not isinstance(c, _RecordConfig))
+        return cast(Trainer, trainer)
+
     def _parse_ckpt_path(self) -> None:
-        """Checks the local file, without which Lightning would run what a URL says."""
+        """Check the local file, without which Lightning would run what a URL says."""
         config = self.config[self.config.subcommand]
         if config.get("ckpt_path") == "last":
             config.ckpt_path = _newest(Path(config.run_dir))
@@ -173,7 +209,7 @@ class StageCLI(LightningCLI):
         config.weights_only = True
 
     def _run_subcommand(self, subcommand: str) -> None:
-        """Runs the command, unless another process does the same in ``run_dir``."""
+        """Run the command, unless another process does the same in ``run_dir``."""
         run_dir = Path(self.config[subcommand].run_dir)
         what = f"runs r3dpa {subcommand} in {run_dir}"
         first = cast(Any, rank_zero_only).rank == 0  # known before there is a trainer
@@ -189,12 +225,42 @@ class StageCLI(LightningCLI):
             super()._run_subcommand(subcommand)
 
     def before_fit(self) -> None:
-        """Loads the stage before: what does not fit is said before hours of data preparation."""
+        """Load the stage before: what does not fit is said before hours of data preparation."""
         if isinstance(self.model, GenerativeModule) and self._ckpt_path is None:
             self.model.load_previous_stage()
+            option, consequence = _WITHOUT_WEIGHTS.get(self.model.stage, ("", ""))
+            if option and getattr(self.model, option) is None:
+                rank_zero_info(f"without --model.init_args.{option} {consequence}")
+        self._say_global_batch()
+        for callback in cast(Any, self.trainer).callbacks:
+            if isinstance(callback, _RecordConfig):
+                callback.hold_wandb_back(self.trainer)
+
+    def _say_global_batch(self) -> None:
+        """Name the samples per step, which grow with the number of processes."""
+        batch_size = getattr(self.datamodule, "batch_size", None)
+        if batch_size is None:
+            return
+        processes = self.trainer.world_size
+        accumulated = self.trainer.accumulate_grad_batches
+        rank_zero_info(
+            f"global batch: {batch_size * processes * accumulated} = {batch_size} per process x "
+            f"{processes} processes x {accumulated} accumulated"
+        )
+
+    def after_fit(self) -> None:
+        """Name the checkpoint, and the command that takes it."""
+        run_dir = Path(self.config[self.subcommand].run_dir)
+        ckpt, stage = _newest(run_dir), getattr(self.model, "stage", None)
+        if ckpt is None or stage is None:
+            return
+        command = _NEXT_COMMANDS.get(stage, _SAMPLE_COMMAND)
+        preset = f" --preset {self._preset}" if self._preset else ""
+        command = command.format(ckpt=ckpt, run_dir=run_dir, preset=preset)
+        rank_zero_info(f"checkpoint: {ckpt}; next: r3dpa {command}")
 
     def before_predict(self) -> None:
-        """Refuses to use random weights."""
+        """Refuse to use random weights."""
         if self._ckpt_path is None:
             raise ValueError(f"{self.subcommand} needs trained weights: give --ckpt_path")
 
@@ -210,7 +276,7 @@ class StageCLI(LightningCLI):
         return self.config[self.subcommand].ckpt_path
 
     def before_instantiate_classes(self) -> None:
-        """Points loggers at the run's folder; `test` and a resumed `fit` join the wandb run."""
+        """Point loggers at the run's folder; `test` and a resumed `fit` join the wandb run."""
         config = self.config[self.subcommand]
         if self.subcommand == "predict" and config.return_predictions is None:
             config.return_predictions = False  # they are on disk; all of KITTI-360 is 20 GB
@@ -225,7 +291,7 @@ class StageCLI(LightningCLI):
                     self._name_wandb_run(arguments, run_dir)
 
     def _name_wandb_run(self, init_args: Any, run_dir: Path) -> None:
-        """Fills what the configuration leaves open; `test` and a resumed `fit` join the run."""
+        """Fill what the configuration leaves open; `test` and a resumed `fit` join the run."""
         model, note = self.config[self.subcommand].get("model"), run_dir / "wandb_id.txt"
         if self.subcommand == "fit" and not note.exists():
             write_text(note, uuid.uuid4().hex[:8])
@@ -238,37 +304,19 @@ class StageCLI(LightningCLI):
         for key, value in names.items():
             if init_args.get(key) is None:
                 init_args[key] = value
+        if init_args.get("offline"):  # nothing to look at on the web
+            os.environ.setdefault("WANDB_SILENT", "true")
 
 
 def _newest(run_dir: Path) -> str | None:
-    found = list((run_dir / "checkpoints").glob("[!.]*.ckpt"))
-    return str(max(found, key=lambda path: path.stat().st_mtime_ns)) if found else None
-
-
-def _with_preset(words: list[str]) -> list[str]:
-    """``STAGE [--preset NAME]`` after the command as the shipped configurations."""
-    if not words or words[0].startswith("-"):
-        return words
-    stage, preset, rest = words[0], "kitti360", words[1:]
-    if "--preset" in rest[:-1]:
-        place = rest.index("--preset")
-        preset = rest[place + 1]
-        del rest[place : place + 2]
-    conf, demo = conf_folder(), preset == "demo"
-    stages = {p.stem: f"{k}/{p.stem}" for k in _STAGES for p in sorted((conf / k).glob("*.yaml"))}
-    presets = [path.stem for path in sorted((conf / "data").glob("*.yaml"))]
-    for kind, name, known in (("stage", stage, stages), ("data", preset, presets)):
-        if name not in known:
-            raise ValueError(f"there is no {kind} {name!r}; give one of {', '.join(known)}")
-    data = "dead_leaves" if demo and stage in ("image_vae", "rgb_pretraining") else preset
-    names = ["trainer", *(["demo/trainer"] if demo else []), f"data/{data}", stages[stage]]
-    if demo and (conf / "demo" / f"{stage}.yaml").is_file():
-        names.append(f"demo/{stage}")
-    configs = [word for name in names for word in ("--config", str(conf / f"{name}.yaml"))]
-    return [*configs, "--run_dir", f"runs/{preset}/{stage}", *rest]
+    """Newest checkpoint of a run, if it has one."""
+    checkpoints = (run_dir / "checkpoints").glob("[!.]*.ckpt")
+    newest = max(checkpoints, key=lambda path: path.stat().st_mtime_ns, default=None)
+    return None if newest is None else str(newest)
 
 
 def run(args: list[str]) -> None:
-    """Runs a stage command: ``["fit", "--config", "x.yaml"]``, ``["fit", "joint"]``."""
-    ignore_harmless_warnings()
-    StageCLI([args[0], *_with_shipped(_with_preset(args[1:]))])
+    """Run a stage command: ``["fit", "--config", "x.yaml"]``, ``["fit", "joint"]``."""
+    ignore_harmless_notices()
+    words, preset = expand_preset(args[1:])
+    StageCLI([args[0], *find_configs(words)], preset)

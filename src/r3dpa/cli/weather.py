@@ -276,7 +276,7 @@ def _summary(lines: list[dict[str, Any]], num_now: int, out: Path) -> str:
 def _write_page(job: _Job, files: list[Path]) -> None:
     """Page of scans, each beside its result."""
     from r3dpa import viz
-    from r3dpa.cli.scene_files import write_page
+    from r3dpa.viz.scenes import write_page
 
     before: list[viz.PageScan] = []
     after: list[viz.PageScan] = []

@@ -128,7 +128,7 @@ class Augmentation:
             return
         raise ValueError(
             f"augmentation.{reason}. Switch it off, or encode in each step: "
-            "model.init_args.cache_latents: false"
+            "--model.init_args.cache_latents false"
         )
 
 

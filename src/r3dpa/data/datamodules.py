@@ -109,6 +109,11 @@ class LidarDataModule(LoaderModule):
         self.prepare_data_per_node = prepare_data_per_node
         at_least(2, val_every=val_every)
         at_least(1, limit=limit)
+        if not isinstance(sensor, LidarSensor):
+            raise ValueError(
+                "sensor must be a LidarSensor (image size, field of view and range limits), got "
+                f"{sensor!r}; the instrument of simulated scans is simulation_sensor"
+            )
         self.scans, self.sensor, self.codec = scans, sensor, codec
         self.projection_kind = projection
         self.grid_size = (grid_size[0], grid_size[1])
@@ -228,7 +233,7 @@ class LidarDataModule(LoaderModule):
         if self.weather_prior is not None:
             raise ValueError(
                 "weather: cached posteriors are those of the clear scans. Switch it off, or encode "
-                "in each step: model.init_args.cache_latents: false"
+                "in each step: --model.init_args.cache_latents false"
             )
         self.train_set = replace(self.train_set, posteriors=posteriors)
 
@@ -415,7 +420,7 @@ class PointDataModule(LoaderModule):
         super().__init__(batch_size, num_workers, seed)
         if source.extractor is not None:
             raise ValueError(
-                "data.init_args.source.init_args.extractor must be null: a network on points is "
+                "--data.init_args.source.init_args.extractor must be null: a network on points is "
                 "trained without feature grids"
             )
         self.source, self.prepare, self.weather_prior = source, prepare, weather

@@ -91,7 +91,7 @@ class GenerativeModule(Stage):
         compile: bool = False,
     ) -> None:
         if not 0 <= latent_noise <= 1:
-            raise ValueError(f"model.latent_noise must lie in [0, 1], got {latent_noise}")
+            raise ValueError(f"latent_noise must lie in [0, 1], got {latent_noise}")
         super().__init__(optimizer, seed, time_sampling)
         with networks_as_settings():
             self.save_hyperparameters()
@@ -141,8 +141,8 @@ class GenerativeModule(Stage):
         sensor = geometry.projection.sensor
         if geometry.codec.reflectance:
             raise ValueError(
-                f"stage {self.stage} has no use for the reflectance of data.codec, which the "
-                "baselines generate: set codec.reflectance to false"
+                f"stage {self.stage} has no use for the reflectance of the images, which the "
+                "baselines generate: set --data.init_args.codec.reflectance to false"
             )
         check_image(self.vae, geometry.codec)
         check_latents(self.vae, self.sit, (sensor.beams, sensor.columns))
@@ -161,13 +161,15 @@ class GenerativeModule(Stage):
         if tuple(geometry.grid_size) != tuple(self.sit.grid_size):
             raise ValueError(
                 f"feature grids are {geometry.grid_size}, but the {type(self.sit).__name__} has "
-                f"{tuple(self.sit.grid_size)} tokens; set data.grid_size to the latter"
+                f"{tuple(self.sit.grid_size)} tokens; set --data.init_args.grid_size to the "
+                f"latter"
             )
         feature_dim = getattr(datamodule, "feature_dim", self.sit.feature_dim)
         if feature_dim != self.sit.feature_dim:
             raise ValueError(
-                f"features have width {feature_dim}, but sit.feature_dim is "
-                f"{self.sit.feature_dim}; set it to the former"
+                f"features have width {feature_dim}, but the {type(self.sit).__name__} has "
+                f"feature_dim {self.sit.feature_dim}; set "
+                "--model.init_args.sit.init_args.feature_dim to the former"
             )
 
     def on_fit_start(self) -> None:
@@ -186,8 +188,8 @@ class GenerativeModule(Stage):
         if self.rgb_weights is not None:
             if not isinstance(self.sit, SiT):
                 raise ValueError(
-                    f"rgb_weights start a SiT, but model.sit is a {type(self.sit).__name__}; "
-                    "leave rgb_weights out"
+                    "--model.init_args.rgb_weights start a SiT, but the network is a "
+                    f"{type(self.sit).__name__}: leave them out"
                 )
             rgb = read_checkpoint(self.rgb_weights)
             rows = transfer_rgb(rgb, self.sit, self.latent_norm, self.keep_projector)
@@ -427,6 +429,6 @@ def check_image(vae: VAE, codec: RangeCodec) -> None:
     of_codec += f"num_classes {codec.num_classes}"
     if of_vae != of_codec:
         raise ValueError(
-            f"model.vae is one of images with {of_vae}, but data.codec gives {of_codec}: set "
-            "in_channels, intensity and num_classes of the former to the latter"
+            f"the VAE is one of images with {of_vae}, but --data.init_args.codec gives {of_codec}: "
+            "set in_channels, intensity and num_classes of --model.init_args.vae to the latter"
         )

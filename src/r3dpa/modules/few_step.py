@@ -85,11 +85,11 @@ class FewStep(FlowMatching):
     ) -> None:
         if not isinstance(sit, AverageVelocitySiT):
             raise ValueError(
-                "stage few_step trains a copy of the last blocks of the SiT: give model.sit the "
-                "class_path r3dpa.nn.AverageVelocitySiT"
+                "stage few_step trains a copy of the last blocks of the SiT: set "
+                "--model.init_args.sit.class_path to r3dpa.nn.AverageVelocitySiT"
             )
         if trajectories < 1:
-            raise ValueError(f"model.trajectories must be at least 1, got {trajectories}")
+            raise ValueError(f"trajectories must be at least 1, got {trajectories}")
         super().__init__(vae, sit, **kwargs)
         if thin_decoder is not None:
             _check_thin_decoder(thin_decoder, vae)
@@ -104,7 +104,8 @@ class FewStep(FlowMatching):
         """The averaged flow as the networks of this stage, its last blocks copied."""
         if before.interpolant != self.interpolant.path:
             raise ValueError(
-                f"{before.path} was trained on the {before.interpolant} path: set model.path to it"
+                f"{before.path} was trained on the {before.interpolant} path: set "
+                "--model.init_args.path to it"
             )
         before = super().previous_networks(before)
         flow = before.network("ema")

@@ -67,14 +67,14 @@ class FlowMatching(GenerativeModule):
         """Loads the trained VAE and its latent statistics; refuses to start without them."""
         if self.init_from is None:
             raise ValueError(
-                f"stage {self.stage} trains on the latents of a trained VAE: give model.init_from "
-                f"a checkpoint of stage {self.starts_from}"
+                f"stage {self.stage} trains on the latents of a trained VAE: give "
+                f"--model.init_args.init_from a checkpoint of stage {self.starts_from}"
             )
         super().load_previous_stage()
         if not self.latent_norm.fitted:
             raise ValueError(
                 f"stage {self.stage} trains with fixed latent statistics, and {self.init_from} "
-                "gave none: let model.init_networks name latent_norm beside vae"
+                "gave none: let --model.init_args.init_networks name latent_norm beside vae"
             )
 
     def setup(self, stage: str) -> None:

@@ -71,8 +71,8 @@ class PointPretraining(LightningModule):
             )
         if masking.grid.cells != self.network.cells:
             raise ValueError(
-                f"model.init_args.network has cells {list(self.network.cells)}, but the grid of "
-                f"data.init_args.prepare has {list(masking.grid.cells)}: make them equal."
+                f"--model.init_args.network has cells {list(self.network.cells)}, but the grid of "
+                f"--data.init_args.prepare has {list(masking.grid.cells)}: make them equal"
             )
         self.grid = masking.grid
 

@@ -98,9 +98,9 @@ class RGBPretraining(ImageStage):
         check_latents(self.vae, self.sit, (size, size))
         if stage == "fit" and not all(one.trained for one in self._teacher):
             raise ValueError(
-                "the teacher has random weights: give model.init_args.teacher.init_args.weights "
+                "the teacher has random weights: give --model.init_args.teacher.init_args.weights "
                 "the file of a trained one, such as dinov2_vitb14_pretrain.pth, or train without "
-                "(model.init_args.teacher null, model.init_args.weights.sit_alignment 0)"
+                "(--model.init_args.teacher null --model.init_args.weights.sit_alignment 0)"
             )
 
     def on_fit_start(self) -> None:
@@ -109,7 +109,7 @@ class RGBPretraining(ImageStage):
             if self.init_from is None:
                 raise ValueError(
                     "stage rgb_pretraining trains on the latents of a trained image VAE: give "
-                    "model.init_from a checkpoint of stage image_vae, or the "
+                    "--model.init_args.init_from a checkpoint of stage image_vae, or the "
                     "diffusion_pytorch_model.safetensors of Stable Diffusion's VAE"
                 )
             load_into({"vae": self.vae}, read_checkpoint(self.init_from), stage=self.stage)

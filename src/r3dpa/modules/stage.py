@@ -19,6 +19,7 @@ from torchmetrics.utilities import dim_zero_cat
 from r3dpa import __version__, losses
 from r3dpa.data.augmentation import Augmentation
 from r3dpa.flow.interpolant import LINEAR, Interpolant, sample_time
+from r3dpa.flow.noise import random_generator
 from r3dpa.geometry import ScanGeometry
 from r3dpa.io import source_commit
 from r3dpa.modules.settings import LossWeights, OptimizerConfig, TimeSampling
@@ -108,7 +109,7 @@ class Stage(L.LightningModule, ABC):
         geometry = getattr(datamodule, "geometry", None)
         if not isinstance(geometry, ScanGeometry):
             raise ValueError(
-                f"data.class_path: {type(self).__name__} needs a data module that gives "
+                f"--data.class_path: {type(self).__name__} needs a data module that gives "
                 "r3dpa.data.LidarBatch batches and has a geometry (r3dpa.geometry.ScanGeometry), "
                 f"such as r3dpa.data.LidarDataModule, got {type(datamodule).__name__}"
             )
@@ -444,18 +445,18 @@ def check_trainer(trainer: L.Trainer) -> None:
     settings = cast(Any, trainer)
     if settings.precision not in _PRECISIONS:
         raise ValueError(
-            f"trainer.precision {settings.precision} is not supported, as weights, statistics and "
-            f"prepared scans are float32: give one of {', '.join(_PRECISIONS)}"
+            f"--trainer.precision {settings.precision} is not supported, as weights, statistics "
+            f"and prepared scans are float32: give one of {', '.join(_PRECISIONS)}"
         )
     if settings.reload_dataloaders_every_n_epochs:
         raise ValueError(
-            "trainer.reload_dataloaders_every_n_epochs would break the order of a resumed run: "
+            "--trainer.reload_dataloaders_every_n_epochs would break the order of a resumed run: "
             "leave it out; the loaders shuffle each epoch anew"
         )
     if any(isinstance(callback, StochasticWeightAveraging) for callback in settings.callbacks):
         raise ValueError(
             "StochasticWeightAveraging is not supported: leave the callback out; stages that train "
-            "a SiT keep an average of their own, see model.ema_decay"
+            "a SiT keep an average of their own, see --model.init_args.ema_decay"
         )
 
 
@@ -463,12 +464,14 @@ def check_latents(vae: VAE | ImageVAE, sit: VelocityNetwork, image_size: tuple[i
     """Refuses a velocity network of other latents than the images have."""
     if sit.in_channels != vae.latent_channels:
         raise ValueError(
-            f"sit.in_channels is {sit.in_channels}, but the VAE has {vae.latent_channels} latent "
-            "channels; give both the same number"
+            f"the {type(sit).__name__} has in_channels {sit.in_channels}, but the VAE has "
+            f"{vae.latent_channels} latent channels; set "
+            "--model.init_args.sit.init_args.in_channels to the latter"
         )
     latent_size = vae.latent_size(image_size)
     if latent_size != tuple(sit.input_size):
         raise ValueError(
-            f"images of {image_size} pixels give {latent_size} latents, but sit.input_size is "
-            f"{tuple(sit.input_size)}; set it to the former"
+            f"images of {image_size} pixels give {latent_size} latents, but the "
+            f"{type(sit).__name__} has input_size {tuple(sit.input_size)}; set "
+            "--model.init_args.sit.init_args.input_size to the former"
         )

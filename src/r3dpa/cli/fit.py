@@ -1,0 +1,135 @@
+"""Commands whose parsers need Lightning: simple mistakes are answered before it is imported."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import NoReturn
+
+from r3dpa.cli.messages import suggestion
+from r3dpa.cli.presets import (
+    DEFAULT_PRESET,
+    conf_folder,
+    expand_preset,
+    preset_names,
+    stage_files,
+)
+from r3dpa.pretrained import weights_file
+
+# Options of the stage commands, those of Lightning included, or the first part of their names.
+_OPTIONS = (
+    "help",
+    "config",
+    "print_config",
+    "preset",
+    "run_dir",
+    "ckpt_path",
+    "allow_import",
+    "model",
+    "data",
+    "trainer",
+    "checkpoint",
+    "scorer",
+    "optimizer",
+    "lr_scheduler",
+    "seed_everything",
+    "weights_only",
+    "return_predictions",
+    "verbose",
+    "datamodule",
+)
+_CHECKPOINT_OPTIONS = (
+    "--ckpt_path",
+    "--model.init_args.init_from",
+    "--model.init_args.rgb_weights",
+)
+_CHECKPOINT_WORDS = ("last", "best", "hpc", "null")  # of --ckpt_path, beside files
+
+
+def run(args: list[str]) -> None:
+    """Run a stage command, ``["fit", "joint"]``, and answer simple mistakes at once.
+
+    Raises:
+        ValueError: If there is no such stage or preset.
+        FileNotFoundError: If a checkpoint does not exist.
+    """
+    command, words = args[0], args[1:]
+    _check_words(command, words)
+    overview = _overview(command)
+    if "-h" in words or "--help" in words:
+        sys.stdout.write(f"{overview}\n")
+        sys.stdout.flush()  # the options of Lightning follow after seconds
+    elif not _names_stage(words):
+        sys.stderr.write(f"{overview}\n\n")
+        _refuse(command, "give a stage, or --config FILE")
+    expand_preset(words)  # refuses an unknown stage or preset
+    from r3dpa.cli.stages import run as run_stage
+
+    run_stage(args)
+
+
+def features(args: list[str]) -> None:
+    """Run ``data features``, given its name and the words after it.
+
+    Raises:
+        ValueError: If the data do not exist.
+    """
+    for option, value in _options(args[1:]):
+        if option == "--data" and "/" in value and not Path(value).exists():
+            raise ValueError(f"--data {value}: no such folder of scans or data YAML")
+    from r3dpa.cli.features import features as write_features
+
+    write_features(args)
+
+
+def _names_stage(words: list[str]) -> bool:
+    """Whether the words start with a stage, or give a configuration or a model."""
+    if words and not words[0].startswith("-"):
+        return True
+    return any(word.startswith(("--config", "--model", "-c")) for word in words)
+
+
+def _overview(command: str) -> str:
+    """What a stage command takes, before the options that Lightning lists."""
+    lines = [f"usage: r3dpa {command} STAGE [--preset NAME] [options]"]
+    lines += [f"       r3dpa {command} --config FILE [--config FILE ...] [options]", "", "stages:"]
+    for stage, path in stage_files().items():
+        comment = path.read_text().partition("\n")[0].removeprefix("# ")
+        lines.append(f"  {stage:<17}{comment.partition(': ')[0].rstrip(':.')}")
+    lines += ["", f"presets (data; default: {DEFAULT_PRESET}):", f"  {', '.join(preset_names())}"]
+    lines += ["", "A run writes to --run_dir; --ckpt_path last resumes it."]
+    return "\n".join(lines)
+
+
+def _refuse(command: str, problem: str) -> NoReturn:
+    """Print a usage error as the parsers do, and exit."""
+    sys.stderr.write(f"r3dpa {command}: {problem}; see r3dpa {command} --help\n")
+    sys.exit(2)
+
+
+def _options(words: list[str]) -> Iterator[tuple[str, str]]:
+    """Options and the word after each, or the text after its ``=``."""
+    for word, following in pairwise([*words, ""]):
+        option, equals, value = word.partition("=")
+        if option.startswith("--"):
+            yield option, value if equals else following
+
+
+def _check_words(command: str, words: list[str]) -> None:
+    """Refuse unknown options and absent files, as far as that needs no class."""
+    checkpoint_options = () if "--print_config" in words else _CHECKPOINT_OPTIONS
+    for option, value in _options(words):
+        name = option[2:].partition(".")[0].rstrip("+")
+        if not any(known.startswith(name) for known in _OPTIONS):  # argparse takes short forms
+            near = suggestion(option, [f"--{known}" for known in _OPTIONS])
+            _refuse(command, f"unknown option {option}{near}")
+        is_file = Path(value).exists() or (conf_folder().parent / value).exists()
+        if option == "--config" and value.endswith((".yaml", ".yml")) and not is_file:
+            _refuse(command, f"--config: no file {value}")
+        if option in checkpoint_options and not value.startswith((*_CHECKPOINT_WORDS, "hf:/")):
+            try:
+                weights_file(value)
+            except FileNotFoundError as error:
+                raise FileNotFoundError(f"{option}: {error}") from None

@@ -1,0 +1,92 @@
+"""Stages and presets of ``r3dpa fit joint --preset demo``, known before torch is imported."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import NamedTuple
+
+from r3dpa.cli.messages import suggestion
+
+DEFAULT_PRESET = "kitti360"
+_STAGE_FOLDERS = ("experiment", "baseline")
+
+
+class StageWords(NamedTuple):
+    """Words of a stage command, with the files of a stage in place of its name."""
+
+    words: list[str]
+    preset: str | None  # None where the words name files themselves
+
+
+def conf_folder() -> Path:
+    """Folder of the shipped configurations, in a checkout and in an installed package alike."""
+    return Path(str(files("r3dpa") / "conf"))
+
+
+def shipped(path: str | Path) -> Path:
+    """Return the file, or the one of the package where ``conf/...`` does not exist here."""
+    of_package = conf_folder().parent / path
+    is_shipped = not Path(path).exists() and of_package.exists()
+    return of_package if is_shipped else Path(path)
+
+
+def find_configs(words: Sequence[str]) -> list[str]:
+    """Replace the files after ``--config`` by those that :func:`shipped` finds."""
+    replaced: list[str] = []
+    for word in words:
+        name, _, value = word.partition("=")
+        if name == "--config" and value.startswith("conf/"):
+            word = f"--config={shipped(value)}"
+        elif replaced[-1:] == ["--config"] and word.startswith("conf/"):
+            word = str(shipped(word))
+        replaced.append(word)
+    return replaced
+
+
+def stage_files() -> dict[str, Path]:
+    """Return the configurations that choose a model, by stage; overlays do not choose one."""
+    stages = {}
+    for folder in _STAGE_FOLDERS:
+        for path in sorted((conf_folder() / folder).glob("*.yaml")):
+            if "\nmodel:\n  class_path: " in path.read_text():
+                stages[path.stem] = path
+    return stages
+
+
+def expand_preset(words: list[str]) -> StageWords:
+    """Replace ``STAGE [--preset NAME]`` by the shipped configurations.
+
+    Raises:
+        ValueError: If there is no such stage or preset.
+    """
+    if not words or words[0].startswith("-"):
+        return StageWords(words, None)
+    stage, rest, preset = words[0], list(words[1:]), DEFAULT_PRESET
+    if "--preset" in rest[:-1]:
+        place = rest.index("--preset")
+        preset = rest[place + 1]
+        del rest[place : place + 2]
+    conf, demo, stages = conf_folder(), preset == "demo", stage_files()
+    _check_known("stage", stage, list(stages))
+    _check_known("preset", preset, preset_names())
+    data = "dead_leaves" if demo and stage in ("image_vae", "rgb_pretraining") else preset
+    configs = [conf / "trainer.yaml", conf / "data" / f"{data}.yaml", stages[stage]]
+    if demo:
+        configs.insert(1, conf / "demo" / "trainer.yaml")
+        overlay = conf / "demo" / f"{stage}.yaml"
+        configs += [overlay] if overlay.is_file() else []
+    expanded = [word for path in configs for word in ("--config", str(path))]
+    return StageWords([*expanded, "--run_dir", f"runs/{preset}/{stage}", *rest], preset)
+
+
+def preset_names() -> list[str]:
+    """Return the names of the shipped data configurations."""
+    return [path.stem for path in sorted((conf_folder() / "data").glob("*.yaml"))]
+
+
+def _check_known(kind: str, name: str, known: list[str]) -> None:
+    if name not in known:
+        near = suggestion(name, known)
+        raise ValueError(f"unknown {kind} '{name}'{near}; choose from {', '.join(known)}")

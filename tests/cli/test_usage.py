@@ -1,0 +1,235 @@
+"""What a user types: mistakes answered at once, suggestions, help, completion, lines of a fit."""
+
+import json
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+from r3dpa.cli import ALIASES, COMMANDS, OWN_PARSER, main
+from r3dpa.cli.parser import load, make_parser
+from r3dpa.cli.presets import expand_preset, stage_files
+
+MISTAKES = {
+    "fit": "give a stage, or --config FILE",
+    "fit jointly": "unknown stage 'jointly' (did you mean joint?)",
+    "fit joint_demo": "unknown stage 'joint_demo'",
+    "fit joint --preset demoo": "unknown preset 'demoo' (did you mean demo?)",
+    "fit joint --ckptpath last": "unknown option --ckptpath (did you mean --ckpt_path?)",
+    "fit joint --ckpt_path no.ckpt": "--ckpt_path: no checkpoint file no.ckpt",
+    "fit joint --model.init_args.init_from no.ckpt": "--model.init_args.init_from: no checkpoint",
+    "fit --config no.yaml": "--config: no file no.yaml",
+    "smaple": "unknown command 'smaple' (did you mean sample?)",
+    "inpant": "unknown command 'inpant' (did you mean inpaint?)",
+    "sample --out x --ckpt no.ckpt": "no checkpoint file no.ckpt",
+    "sample --out x --stpes 3": "unknown option --stpes (did you mean --steps?)",
+    "edit vary --scan no.bin --out x": "--scan no.bin: no such file or folder",
+    "edit mix --left a.bin --right b.bin --out x": "s.safetensors was trained without 3D features",
+    "data objects --data x --out o.safetensors": "s.safetensors was trained without 3D features",
+    "data view no": "no: no such file or folder",
+    "data weather no --out x": "no: no such file or folder",
+    "data features --data no/data": "--data no/data: no such folder of scans or data YAML",
+    "data reference --data no --out x.safetensors": "--data no: no such file or folder",
+    "convert no.pt x.safetensors": "no.pt: no such file or folder",
+    "report no": "no: no such file or folder",
+    "evaluate --samples no --reference no": "--samples no: no such file or folder",
+}
+
+
+@pytest.fixture(scope="module")
+def answers(tmp_path_factory):
+    """Answers to the mistakes in one process, and whether torch was imported for one of them."""
+    program = f"""
+import sys, json, io, contextlib, pathlib
+from r3dpa.cli import main
+for name in ("a.bin", "b.bin"):
+    pathlib.Path(name).touch()
+answers = []
+for line in {list(MISTAKES)}:
+    text = io.StringIO()
+    with contextlib.redirect_stderr(text):
+        try: main(line.split())
+        except SystemExit: pass
+        except (ValueError, OSError) as error: text.write(str(error))
+    answers.append([text.getvalue(), "torch" in sys.modules])
+print(json.dumps(answers))
+"""
+    folder = tmp_path_factory.mktemp("mistakes")
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(
+        command, cwd=folder, capture_output=True, text=True, check=True, timeout=100
+    )
+    return dict(zip(MISTAKES, json.loads(done.stdout), strict=True))
+
+
+@pytest.mark.parametrize("line", list(MISTAKES))
+def test_a_simple_mistake_is_answered_before_torch_is_imported(line, answers):
+    answer, imported_torch = answers[line]
+    assert MISTAKES[line] in answer
+    assert not imported_torch
+
+
+def test_fit_alone_names_stages_and_presets(answers):
+    answer, _ = answers["fit"]
+    assert all(f"  {stage} " in answer for stage in ("joint", "vae_alignment", "r2dm"))
+    assert "kitti360, " in answer
+    assert "_demo " not in answer
+
+
+def test_overlays_are_no_stages():
+    assert {"joint", "flow_matching", "r2flow"} <= set(stage_files())
+    assert not {"joint_demo", "r2flow_reflow", "r2flow_distilled"} & set(stage_files())
+    words, preset = expand_preset(["joint", "--preset", "demo", "--trainer.max_steps", "3"])
+    assert preset == "demo"
+    assert words[-4:] == ["--run_dir", "runs/demo/joint", "--trainer.max_steps", "3"]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--model.init_args.init_fron x", "--model.init_args.init_fron (did you mean init_from?)"),
+        ("--trainer.max_stepz 3", "--trainer.max_stepz (did you mean --trainer.max_steps?)"),
+        (
+            "--model.init_args.sit.init_args.depth many",
+            "--model.init_args.sit.init_args.depth: expected int, got 'many'",
+        ),
+        ("--data torch.utils.data.DataLoader", "DataLoader is not allowed: a configuration may"),
+    ],
+)
+def test_a_message_names_the_option_as_it_is_typed(words, message, capsys):
+    with pytest.raises(SystemExit):
+        main(["fit", "joint", *words.split()])
+    (line,) = capsys.readouterr().err.splitlines()
+    assert message in line
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--quality bset", "--quality: unknown value 'bset'; choose from instant, draft, good, be"),
+        ("--guidance_interval 0.2", "--guidance_interval: expected a tuple with 2 elements"),
+        ("--formats bin plx", "--formats: unknown value 'plx'; choose from bin, ply, npz"),
+        ("--eta x", "--eta: expected float, got 'x'"),
+    ],
+)
+def test_a_message_says_what_is_accepted(words, message, capsys):
+    with pytest.raises(SystemExit):
+        main(["sample", "--out", "x", *words.split()])
+    assert message in capsys.readouterr().err
+
+
+def help_of(command, capsys):
+    with pytest.raises(SystemExit):
+        main([*command.split(), "--help"])
+    return capsys.readouterr().out
+
+
+def test_help_does_not_end_in_null_and_lists_the_weather(capsys):
+    for command in ("sample", "edit complete", "data reference"):
+        text = help_of(command, capsys)
+        assert "null" not in text
+        assert "<class" not in text
+    text = help_of("data simulate", capsys)
+    assert text.count("  --weather.visibility_m ") == 1
+
+
+def test_fit_help_starts_with_stages_and_presets(capsys):
+    text = help_of("fit", capsys)
+    assert text.startswith("usage: r3dpa fit STAGE [--preset NAME]")
+    assert text.index("\n  joint ") < text.index("--trainer.max_steps")
+
+
+def test_common_names_of_options():
+    """How many of something are made or read is ``--num``, processes are ``--workers``."""
+    counts = {"--limit", "--frames", "--scenes", "--jobs"}
+    for command in COMMANDS.values():
+        if command.target not in OWN_PARSER:
+            names = [action.option_strings for action in make_parser(load(command.target))._actions]
+            assert not [strings for strings in names if strings and strings[0] in counts]
+    simulate = make_parser(load("lidarsim:simulate"))
+    arguments = [simulate.parse_args(["--out", "x", name, "7"]) for name in ("--num", "--scans")]
+    assert [config.scans for config in arguments] == [7, 7]
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
+@pytest.mark.parametrize(
+    ("typed", "completed"),
+    [
+        (["sam"], ["sample"]),
+        (["edit", ""], ["inpaint", "mix", "complete", "vary", "interpolate"]),
+        (["fit", "joi"], ["joint"]),
+        (["fit", "joint", "--pres"], ["--preset"]),
+        (["sample", "--qua"], ["--quality"]),
+        (["view", "--nu"], ["--num"]),
+        (["data", "view", "--nu"], ["--num"]),
+    ],
+)
+def test_completion(typed, completed, capsys):
+    main(["completion", "bash"])
+    script = capsys.readouterr().out
+    words = " ".join(repr(word) for word in ["r3dpa", *typed])
+    script += f"\nCOMP_WORDS=({words}); COMP_CWORD={len(typed)}; _r3dpa; echo ${{COMPREPLY[@]}}"
+    done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == completed
+
+
+def test_short_names_of_commands_are_unique():
+    assert set(ALIASES.values()) <= set(COMMANDS)
+    assert not set(ALIASES) & set(COMMANDS)
+
+
+def logger(kind, **init_args):
+    return {"class_path": f"lightning.pytorch.loggers.{kind}", "init_args": init_args}
+
+
+WANDB = logger("WandbLogger", save_dir="", offline=True)
+CSV = logger("CSVLogger", save_dir="", name="")
+
+
+@pytest.fixture(scope="module")
+def fitted(smoke_args, tmp_path_factory):
+    """A short fit of vae_alignment as a user starts it."""
+    run_dir = tmp_path_factory.mktemp("fitted")
+    words = smoke_args("vae_alignment", run_dir, "--trainer.enable_progress_bar=true")
+    words += [f"--trainer.logger={json.dumps([WANDB, CSV])}", "--trainer.callbacks=[]"]
+    command = [sys.executable, "-m", "r3dpa", *words]
+    return run_dir, subprocess.run(
+        command, capture_output=True, text=True, timeout=200, check=False
+    )
+
+
+def test_a_fit_says_what_it_lacks_and_what_follows(fitted):
+    run_dir, done = fitted
+    assert done.returncode == 0
+    ckpt = run_dir / "checkpoints" / "last.ckpt"
+    assert "without --model.init_args.rgb_weights the frozen SiT is random" in done.stderr
+    assert "global batch: 2 = 2 per process x 1 processes x 1 accumulated" in done.stderr
+    next_command = f"next: r3dpa fit joint --model.init_args.init_from {ckpt}"
+    assert done.stderr.splitlines()[-1] == f"checkpoint: {ckpt}; {next_command}"
+
+
+def test_the_bar_of_a_fit_shows_losses_and_no_notices_remain(fitted):
+    _, done = fitted
+    assert "loss=" in done.stdout
+    assert "kl=" in done.stdout
+    assert "v_num" not in done.stdout
+    notices = ("GPU available", "TPU", "Tip", "anonymous", "Seed set", "wandb sync", "sync_dist")
+    assert not [notice for notice in notices if notice in done.stdout + done.stderr]
+
+
+def test_a_fit_logs_its_configuration_to_wandb(fitted):
+    run_dir, _ = fitted
+    (run,) = run_dir.glob("wandb/offline-run-*/run-*.wandb")
+    content = run.read_bytes()
+    assert b"r3dpa.modules.VAEAlignment" in content
+    assert b"train/reconstruction" in content
+
+
+def test_a_fit_that_is_refused_leaves_no_wandb_run(smoke_args, tmp_path):
+    words = smoke_args("vae_alignment", tmp_path, "--data.init_args.grid_size=[4, 16]")
+    words += [f"--trainer.logger={json.dumps([WANDB])}", "--trainer.callbacks=[]"]
+    with pytest.raises(ValueError, match=r"set --data\.init_args\.grid_size to the latter"):
+        main(words)
+    assert (tmp_path / "config.yaml").is_file()
+    assert not (tmp_path / "wandb").exists()

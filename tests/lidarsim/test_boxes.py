@@ -1,0 +1,75 @@
+"""3-D boxes of the objects of simulated scans, and the names of their classes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+
+from lidarsim import Semantic, Simulator, simulate
+from lidarsim.boxes import KITTI_TYPES, kitti_label
+from lidarsim.drive_files import velodyne_to_world
+from lidarsim.scene import Pose, Primitive, Scene, Shape
+
+
+def boxes_of(text):
+    """Type, size (length, width, height), and place and yaw in the sensor frame, of each line."""
+    for line in text.splitlines():
+        kind, *numbers = line.split()
+        height, width, length, right, down, ahead, rotation_y = map(float, numbers[7:])
+        place = np.array([ahead, -right, -down])
+        yield kind, np.array([length, width, height]), place, -rotation_y - np.pi / 2
+
+
+def test_the_line_of_a_car_is_known():
+    """A car of 4 x 2 x 1.5 m, 10 m ahead of a sensor that looks north, 1.7 m above its wheels."""
+    heading = np.pi / 2
+    car = Primitive(Shape.BOX, (5, 30, 0.75), (2, 1, 0.75), Semantic.CAR, 0.3, heading, instance=7)
+    pose = Pose(x_m=5, y_m=20, z_m=1.7, heading_rad=heading)
+    scan = Simulator().scan(0)
+    labels = np.array([26 | 7 << 16], dtype=np.uint32)
+    scan = replace(scan, scene=Scene((car,), pose), labels=labels)
+    (line,) = kitti_label(scan, velodyne_to_world(pose)).splitlines()
+    expected = "Car 0.00 3 -1.57 -1 -1 -1 -1 1.50 2.00 4.00 0.00 1.70 10.00 -1.57"
+    assert line.replace("-0.00", "0.00") == expected
+    unseen = replace(scan, labels=np.zeros(1, dtype=np.uint32))
+    assert kitti_label(unseen, velodyne_to_world(pose)) == ""
+
+
+def test_points_of_an_object_lie_in_its_box():
+    names = ("rolling_shutter", "moving_actors", "range_noise", "mixed_pixels")
+    off = dict.fromkeys(names, "off")
+    scan = Simulator(seed=0, drive=2, effects=off).scan(40)
+    text = kitti_label(scan, velodyne_to_world(scan.scene.pose))
+    classes = {int(semantic) for semantic in KITTI_TYPES}
+    labels = [label for label in np.unique(scan.labels) if label & 0xFFFF in classes]
+    boxes = list(boxes_of(text))
+    assert len(boxes) == len(labels) > 5
+    for label, (kind, size, place, yaw) in zip(labels, boxes, strict=True):  # both by label
+        assert kind == KITTI_TYPES[Semantic(int(label) & 0xFFFF)]
+        cosine, sine = np.cos(yaw), np.sin(yaw)
+        away = scan.points[scan.labels == label, :3] - place
+        along = away[:, 0] * cosine + away[:, 1] * sine
+        across = away[:, 1] * cosine - away[:, 0] * sine
+        inside = np.abs(along) < size[0] / 2 + 0.15
+        inside &= np.abs(across) < size[1] / 2 + 0.15
+        inside &= (away[:, 2] > -0.15) & (away[:, 2] < size[2] + 0.15)
+        assert inside.mean() > 0.99
+
+
+@pytest.fixture(scope="module")
+def data_set(tmp_path_factory):
+    out = tmp_path_factory.mktemp("boxes")
+    simulate(out, 1, drives=["0002"])
+    return out
+
+
+def test_a_data_set_names_its_classes(data_set):
+    names = yaml.safe_load((data_set / "classes.yaml").read_text())
+    assert names == {int(semantic): semantic.name.lower() for semantic in Semantic}
+
+
+def test_a_data_set_has_boxes_of_each_scan(data_set):
+    (boxes,) = data_set.rglob("boxes/*.txt")
+    assert boxes.stem == "0000000000"
+    assert all(kind in KITTI_TYPES.values() for kind, *_ in boxes_of(boxes.read_text()))
