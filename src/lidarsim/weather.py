@@ -45,6 +45,7 @@ REFUSED = {
     "surface_texture": _HERE,
     "retro_reflection": _HERE,
     "laser_calibration": _HERE,
+    "lost_shots": _HERE,
 }
 # Instrument effects that every recorded scan has: they run where they are switched on.
 _ON_REQUEST = ("blooming", "range_noise")

@@ -185,6 +185,7 @@ LIMITS = {
         POLE,
         sensor=changed(min_power=1e-2 * x or 1e-30, min_range_m=5 * x, threshold_spread=0.0),
     ),
+    "lost_shots": lambda x: case(WALL, CAR, sensor=changed(lost_share=0.09 * x)),
     "range_noise": lambda x: case(
         WALL, CAR, sensor=changed(range_sigma_m=0.1 * x, weak_range_sigma_m=x, range_step_m=0.1 * x)
     ),

@@ -24,7 +24,7 @@ from lidarsim.sweep import Origin
 DRY = Conditions()
 WALL = box((11, 0, 2), (1, 30, 4), material=Material.CONCRETE)
 # Nothing but geometry and the limit of detection.
-EXACT = {"laser_calibration": "off", "range_noise": "off", "soft_raydrop": "off"}
+EXACT = dict.fromkeys(("laser_calibration", "lost_shots", "range_noise", "soft_raydrop"), "off")
 
 
 @pytest.fixture(scope="module")

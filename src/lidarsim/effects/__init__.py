@@ -10,6 +10,7 @@ from lidarsim.effects.instrument import (
     DetectionLimit,
     DualReturn,
     LaserCalibration,
+    LostShots,
     RangeNoise,
     SoftRaydrop,
     SunGlare,
@@ -46,7 +47,7 @@ ECHO_EFFECTS: tuple[Effect, ...] = (
     *(EgoOcclusion(), DiffuseReflection(), SurfaceTexture(), WetGround(), RetroReflection()),
     *(Glass(), PolishedMetal(), MixedPixels()),
     *(Fog(), Rain(), Snow(), Spray()),
-    *(SunGlare(), Blooming(), SoftRaydrop(), DetectionLimit()),
+    *(SunGlare(), Blooming(), SoftRaydrop(), DetectionLimit(), LostShots()),
     *(RangeNoise(), LaserCalibration()),
 )
 EFFECTS = (*RAY_EFFECTS, *ECHO_EFFECTS)

@@ -94,6 +94,7 @@ class SpinningLidar:
     pulse_s: float = 5e-9  # echoes nearer to each other than ``pulse_depth_m`` merge
     overlap_range_m: float = 5.0  # from here on the receiver sees the whole beam
     threshold_spread: float = 0.3  # standard deviation of the logarithm of the threshold
+    lost_share: float = 0.0008  # of shots at the ground that are lost, see ``effects.instrument``
     range_sigma_m: float = 0.008  # range noise of a strong return
     weak_range_sigma_m: float = 0.05  # further noise at a signal-to-noise ratio of 1/2
     range_step_m: float = 0.002  # in which ranges are reported; 0 for none
@@ -109,6 +110,8 @@ class SpinningLidar:
             self, "be 0 or greater", "divergence_rad", "pulse_s", "threshold_spread",
             "range_sigma_m", "weak_range_sigma_m", "range_step_m",
         )  # fmt: skip
+        if not 0 <= self.lost_share < 0.1:
+            raise ValueError(f"lost_share must lie in [0, 0.1), got {self.lost_share}")
         if not 0 <= self.min_range_m < self.max_range_m < math.inf:
             raise ValueError(
                 f"ranges must satisfy 0 <= min_range_m < max_range_m, "

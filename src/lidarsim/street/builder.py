@@ -151,7 +151,7 @@ def build_ground(builder: Builder, draw: Generator, side: float, opening: bool) 
     edge_m, pavement_m = course.kerb(side).edge_m, course.kerb(side).pavement_m
     asphalt = (Semantic.ROAD, Material.ASPHALT, course.road_reflectivity)
     builder.slab(whole, (0.0, side * edge_m), *asphalt)
-    paving = (Semantic.SIDEWALK, Material.PAVING, draw.uniform(0.13, 0.19))
+    paving = (Semantic.SIDEWALK, Material.PAVING, draw.uniform(0.15, 0.215))
     for _ in range(int(draw.poisson(0.7))):
         at = draw.uniform(0.5, edge_m) * side
         builder.puddle(draw, (builder.section.block + draw.random()) * BLOCK_M, at)

@@ -362,7 +362,7 @@ def front_garden(
     path_s, half_m = draw.uniform(0.2, 0.8) * (last - first) + first, draw.uniform(0.5, 0.8)
     start = builder.section.block * BLOCK_M
     along = (path_s - half_m - start, path_s + half_m - start)
-    paving = (Semantic.SIDEWALK, Material.PAVING, draw.uniform(0.13, 0.2))
+    paving = (Semantic.SIDEWALK, Material.PAVING, draw.uniform(0.15, 0.22))
     builder.slab(along, (side * near_m, side * far_m), *paving, sunk_m=-0.02)
     wanted = draw.poisson((last - first) * room_m / _PLANT_M2)
     for _ in range(min(int(wanted), _MOST_PLANTS)):

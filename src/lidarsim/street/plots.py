@@ -103,7 +103,7 @@ def _row_houses(
         at = side * (edge_m + draw.uniform(1.2, setback_m - 0.8))
         garden_tree(builder, draw, draw.uniform(start + 1, end - 1), at)
     if draw.random() < 0.8:
-        _behind(builder, draw, start, side * (edge_m + draw.uniform(17, 25)), 0.95)
+        _behind(builder, draw, start, side * (edge_m + draw.uniform(15, 23)), 0.95)
 
 
 def _houses(builder: Builder, draw: Generator, start: float, side: float, edge_m: float) -> None:
@@ -127,7 +127,7 @@ def _houses(builder: Builder, draw: Generator, start: float, side: float, edge_m
         _side_garden(builder, draw, side, gap_first, gap_last, front_m)
     _drive(builder, draw, drive_s, side, edge_m, setback_m)
     if draw.random() < 0.8:
-        _behind(builder, draw, start, side * (edge_m + draw.uniform(17, 25)), 0.95)
+        _behind(builder, draw, start, side * (edge_m + draw.uniform(15, 23)), 0.95)
 
 
 def _side_garden(
@@ -189,7 +189,7 @@ def _green(builder: Builder, draw: Generator, start: float, side: float, edge_m:
     for _ in range(int(draw.poisson(12.0))):
         at = side * (edge_m + draw.uniform(4, 26))
         shrub(builder, draw, start + draw.uniform(0, BLOCK_M), at)
-    for _ in range(int(draw.poisson(10.0))):
+    for _ in range(int(draw.poisson(12.0))):
         at = side * (edge_m + draw.uniform(4, 26))
         garden_tree(builder, draw, start + draw.uniform(0, BLOCK_M), at)
     _behind(builder, draw, start, side * (edge_m + draw.uniform(10, 28)), 0.85)
@@ -225,8 +225,8 @@ def _fields(builder: Builder, draw: Generator, start: float, side: float, edge_m
     """Open fields behind a verge of tall grass, single trees and poles, a wood far away."""
     verge(builder, draw, side, start, start + BLOCK_M, edge_m, edge_m + 2.5)
     meadow(builder, draw, side, edge_m)
-    for _ in range(int(draw.poisson(1.5))):
-        at = side * (edge_m + draw.uniform(1.5, 8))
+    for _ in range(int(draw.poisson(3.5))):
+        at = side * (edge_m + draw.uniform(1.5, 24))
         garden_tree(builder, draw, start + draw.uniform(0, BLOCK_M), at)
     for _ in range(int(draw.poisson(9.0))):
         at = side * (edge_m + draw.uniform(8, 28))
