@@ -30,7 +30,7 @@ INSTRUMENT = {
     "pulse_s": (5e-9, 5e-9, 0.0, 1e-7),
     "overlap_range_m": (5.0, 5.0, 1e-2, 50.0),
     "threshold_spread": (0.3, 0.3, 0.0, 1e-3, 2.0),
-    "lost_share": (8e-4, 8e-4, 0.0, 0.09),
+    "lost_share": (1e-3, 1e-3, 0.0, 0.09),
     "return_mode": ("strongest", "strongest", "dual"),
 }
 NOISE = {

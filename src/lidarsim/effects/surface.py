@@ -100,7 +100,7 @@ class SurfaceTexture(Effect):
     """
 
     spread: float = 0.36
-    leaf_spread: float = 0.6
+    leaf_spread: float = 0.72
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
         return "base"

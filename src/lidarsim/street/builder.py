@@ -162,7 +162,7 @@ def build_ground(builder: Builder, draw: Generator, side: float, opening: bool) 
         half_m = draw.uniform(2.8, 4.2)
         near, far = (0.0, BLOCK_M / 2 - half_m), (BLOCK_M / 2 + half_m, BLOCK_M)
         for strip in strips:
-            builder.slab((near[1], far[0]), strip, *asphalt, course.kerb_m)
+            builder.slab((near[1], far[0]), strip, *asphalt, course.step_up_m(side))
             builder.slab(near, strip, *paving)
             builder.slab(far, strip, *paving)
         return

@@ -23,7 +23,7 @@ _GUTTER_M = (0.5, 0.9)
 _PARKING_M = 2.1
 # Bins are emptied on one working day of five.
 _COLLECTION_DAYS = 0.2
-_RISE = (-0.02, 0.05)
+_RISE = (-0.02, 0.035)
 # A cross slope that bends on a hill have left dies away by this factor from block to block.
 _LEVELLING = 0.93
 _BLOCKS_PER_TABLE = 32
@@ -60,32 +60,32 @@ class Character(NamedTuple):
 _TOWN = Character(
     lanes=((1, 1), (1, 1), (1, 0)), districts=(0.6, 0.15, 0.0, 0.1, 0.1, 0.05, 0.0),
     parked=(0.17, 0.45), parking=0.8, pavement=1.0, clutter=0.8, people=0.35, lights=True,
-    island=0.3, car_gap_m=(40, 90), people_gap_m=(40, 90), crossing_every=(3, 6), slope=0.02,
+    island=0.3, car_gap_m=(40, 90), people_gap_m=(40, 90), crossing_every=(3, 6), slope=0.01,
 )  # fmt: skip
 _ROW_HOUSES = Character(
     lanes=((1, 1), (1, 0)), districts=(0.1, 0.55, 0.2, 0.1, 0.05, 0.0, 0.0),
     parked=(0.14, 0.45), parking=0.8, pavement=0.95, clutter=1.2, people=0.15, lights=False,
-    island=0.1, car_gap_m=(60, 140), people_gap_m=(50, 140), crossing_every=(4, 8), slope=0.04,
+    island=0.1, car_gap_m=(60, 140), people_gap_m=(50, 140), crossing_every=(4, 8), slope=0.02,
 )  # fmt: skip
 _SUBURB = Character(
     lanes=((1, 1), (1, 0)), districts=(0.05, 0.15, 0.65, 0.05, 0.1, 0.0, 0.0),
     parked=(0.1, 0.41), parking=0.75, pavement=0.95, clutter=1.0, people=0.15, lights=False,
-    island=0.1, car_gap_m=(60, 140), people_gap_m=(60, 160), crossing_every=(4, 8), slope=0.05,
+    island=0.1, car_gap_m=(60, 140), people_gap_m=(60, 160), crossing_every=(4, 8), slope=0.025,
 )  # fmt: skip
 _GREEN = Character(
     lanes=((1, 1),), districts=(0.05, 0.05, 0.15, 0.1, 0.55, 0.1, 0.0),
     parked=(0.07, 0.3), parking=0.4, pavement=0.6, clutter=0.3, people=0.05, lights=False,
-    island=0.2, car_gap_m=(60, 140), people_gap_m=(80, 200), crossing_every=(6, 10), slope=0.06,
+    island=0.2, car_gap_m=(60, 140), people_gap_m=(80, 200), crossing_every=(6, 10), slope=0.03,
 )  # fmt: skip
 _ARTERIAL = Character(
     lanes=((2, 2), (2, 1), (2, 2)), districts=(0.1, 0.05, 0.15, 0.2, 0.4, 0.1, 0.0),
     parked=(0.21, 0.52), parking=0.5, pavement=0.8, clutter=2.2, people=0.1, lights=True,
-    island=0.5, car_gap_m=(40, 70), people_gap_m=(60, 160), crossing_every=(5, 9), slope=0.03,
+    island=0.5, car_gap_m=(40, 70), people_gap_m=(60, 160), crossing_every=(5, 9), slope=0.015,
 )  # fmt: skip
 _COUNTRY = Character(
     lanes=((1, 1),), districts=(0.0, 0.0, 0.2, 0.0, 0.3, 0.05, 0.45),
     parked=(0.03, 0.22), parking=0.15, pavement=0.3, clutter=0.2, people=0.03, lights=False,
-    island=0.2, car_gap_m=(60, 160), people_gap_m=(120, 300), crossing_every=(8, 12), slope=0.06,
+    island=0.2, car_gap_m=(60, 160), people_gap_m=(120, 300), crossing_every=(8, 12), slope=0.03,
 )  # fmt: skip
 
 #: Surroundings by the number of the drive, in turn: KITTI-360 leads mostly through suburbs.
@@ -176,6 +176,10 @@ class Course(NamedTuple):
         """The right (-1) or left (1) side of the road."""
         return self.kerbs[1 if side > 0 else 0]
 
+    def step_up_m(self, lateral: float) -> float:
+        """Height of the kerb on one side of the road; a verge begins without one."""
+        return self.kerb_m if self.kerb(lateral).pavement_m else 0.0
+
     def surface_m(self, lateral: float) -> float:
         """Height of road, pavement or terrain above the plane of the section.
 
@@ -185,7 +189,7 @@ class Course(NamedTuple):
         if abs(lateral) < kerb.edge_m:
             return -_CAMBER * abs(lateral)
         beyond_m = max(abs(lateral) - kerb.edge_m - kerb.pavement_m, 0.0)
-        return self.kerb_m - _CAMBER * kerb.edge_m + kerb.rise * beyond_m
+        return self.step_up_m(lateral) - _CAMBER * kerb.edge_m + kerb.rise * beyond_m
 
     def surface_cross(self, lateral: float) -> float:
         """Rise of that surface per metre to the left, above the plane of the section."""

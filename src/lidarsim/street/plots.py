@@ -189,7 +189,7 @@ def _green(builder: Builder, draw: Generator, start: float, side: float, edge_m:
     for _ in range(int(draw.poisson(12.0))):
         at = side * (edge_m + draw.uniform(4, 26))
         shrub(builder, draw, start + draw.uniform(0, BLOCK_M), at)
-    for _ in range(int(draw.poisson(12.0))):
+    for _ in range(int(draw.poisson(15.0))):
         at = side * (edge_m + draw.uniform(4, 26))
         garden_tree(builder, draw, start + draw.uniform(0, BLOCK_M), at)
     _behind(builder, draw, start, side * (edge_m + draw.uniform(10, 28)), 0.85)

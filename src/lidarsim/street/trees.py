@@ -20,16 +20,16 @@ _BARK = 0.15
 # Chance of a hit per metre. Real crowns and edges of woods return from a shell whose neighbouring
 # shots differ by a decimetre, but by more than 0.5 m in every seventh pair: clumps are dense, and
 # single leaves and twigs stand around and between them.
-_CLUMP_PER_M = (1.5, 4.5)
+_CLUMP_PER_M = (2.0, 6.0)
 _TWIGS_PER_M = (0.2, 0.5)
-_SCREEN_PER_M = (1.5, 3.0)
-_NEEDLES_PER_M = (2.5, 6.0)
+_SCREEN_PER_M = (2.0, 4.0)
+_NEEDLES_PER_M = (3.0, 8.0)
 # Clear stems: 2.5 m above pavements where it is pruned, less where it is not.
 _STREET_STEM_M, _LOW_STEM_M = (2.1, 3.0), (1.6, 2.1)
 # A low crown is cut back at the kerb, where cars pass.
 _LOW_CROWN_M = (1.8, 3.0)
 # Per 18 m of the edge of a wood; of its trunks those before the leaves.
-_WOOD_SCREENS, _WOOD_TRUNKS, _WOOD_CROWNS, _WOOD_SHRUBS = 2, 8, 12, 12
+_WOOD_SCREENS, _WOOD_TRUNKS, _WOOD_CROWNS, _WOOD_SHRUBS = 2, 12, 12, 12
 _TUFTS_PER_MEADOW = 7
 
 
@@ -278,7 +278,7 @@ def meadow(builder: Builder, draw: Generator, side: float, edge_m: float) -> Non
     """A meadow: a thin layer of blades over the terrain, and tufts that stand out of it."""
     start = builder.section.block * BLOCK_M
     across = (side * (edge_m + 1.5), side * (edge_m + 19.5))
-    deep_m = draw.uniform(0.1, 0.35)
+    deep_m = draw.uniform(0.05, 0.15)
     grass(builder, (start, start + BLOCK_M), across, deep_m, draw.uniform(1.5, 4.0))
     for _ in range(int(draw.poisson(_TUFTS_PER_MEADOW))):
         place = (start + draw.uniform(0, BLOCK_M), side * (edge_m + draw.uniform(1.5, 14.0)))
