@@ -114,8 +114,8 @@ class LostShots(Effect):
         goes_on: Probability that the next shot is lost as well, in [0, 1).
     """
 
-    upright: float = 2.5
-    rough: float = 15.0
+    upright: float = 1.5
+    rough: float = 10.0
     goes_on: float = 0.25
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:

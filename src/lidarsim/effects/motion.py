@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
+from scipy.special import ndtr
 
 from lidarsim.draws import Draws, RayIndex, generator_for
 from lidarsim.raycast import cast, normals
@@ -19,7 +20,9 @@ from lidarsim.sweep import Effect, Origin, Sweep
 
 # Widths of a clump in beams and shots, smaller and larger ones alike, and the spread of the
 # logarithm of the density of leaves.
-_CLUMP_RAYS, _CLUMP_SPREAD = ((0.7, 1.2), (2.0, 6.0)), 1.0
+_CLUMP_RAYS, _CLUMP_SPREAD = ((0.7, 1.2), (2.0, 6.0)), 0.7
+# Correlation of a ray's own depth with the field of the clumps.
+_ALIKE = np.float32(0.9)
 
 
 class RollingShutter(Effect):
@@ -105,19 +108,20 @@ class FoliageOcclusion(Effect):
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
         shift = int(sweep.num_rays * draws.uniform(slice(0, 1))[0])
         clumps = np.roll(_clumps(sweep.shape), shift)
-        sweep.optical_depth = draws.exponential(slice(None)) * clumps
+        mixed = _ALIKE * clumps + np.float32(math.sqrt(1 - _ALIKE**2)) * draws.normal(slice(None))
+        density = np.exp(_CLUMP_SPREAD * clumps - np.float32(_CLUMP_SPREAD**2 / 2))
+        sweep.optical_depth = -np.log(ndtr(-mixed)) * density
 
 
 @lru_cache(maxsize=4)
 def _clumps(shape: tuple[int, int]) -> Floats:
-    """Factors ``(R,)`` of the depth in leaves, of mean 1 and alike for neighbouring rays."""
+    """Standard normal field ``(R,)``, alike for neighbouring rays."""
     generator = generator_for("clumps", *shape)
     field = np.zeros(shape)
     for width in _CLUMP_RAYS:
         part = gaussian_filter(generator.standard_normal(shape), width, mode="wrap")
         field += part / part.std() / math.sqrt(len(_CLUMP_RAYS))
-    factor = np.exp(_CLUMP_SPREAD * field - _CLUMP_SPREAD**2 / 2)
-    return factor.astype(np.float32).reshape(-1)
+    return field.astype(np.float32).reshape(-1)
 
 
 class EgoOcclusion(Effect):

@@ -100,7 +100,7 @@ class SurfaceTexture(Effect):
     """
 
     spread: float = 0.36
-    leaf_spread: float = 0.72
+    leaf_spread: float = 0.62
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
         return "base"

@@ -16,7 +16,7 @@ from lidarsim.street.trees import LEAVES, clump, garden_tree, grass, tuft
 
 # A clipped hedge stops a beam within a decimetre, as those of real scans do; a free one within two
 # or three.
-_CLIPPED_PER_M, _FREE_PER_M = (9.0, 16.0), (2.5, 6.5)
+_CLIPPED_PER_M, _FREE_PER_M = (9.0, 16.0), (3.5, 9.0)
 # Openings for people and for cars.
 _PATH_M, _DRIVE_M = (0.9, 1.3), (2.7, 3.4)
 # A front garden has a plant per this many square metres, and at most so many.

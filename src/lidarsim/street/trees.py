@@ -20,7 +20,7 @@ _BARK = 0.15
 # Chance of a hit per metre. Real crowns and edges of woods return from a shell whose neighbouring
 # shots differ by a decimetre, but by more than 0.5 m in every seventh pair: clumps are dense, and
 # single leaves and twigs stand around and between them.
-_CLUMP_PER_M = (2.0, 6.0)
+_CLUMP_PER_M = (2.5, 7.0)
 _TWIGS_PER_M = (0.2, 0.5)
 _SCREEN_PER_M = (2.0, 4.0)
 _NEEDLES_PER_M = (3.0, 8.0)
