@@ -87,7 +87,7 @@ def test_limits_of_power_and_range():
     assert kept[8:].all()
 
 
-@pytest.mark.parametrize(("material", "factor"), [("ASPHALT", 1), ("BRICK", 2.5), ("FOLIAGE", 15)])
+@pytest.mark.parametrize(("material", "factor"), [("ASPHALT", 1), ("BRICK", 1.2), ("FOLIAGE", 10)])
 def test_share_of_lost_shots_by_material(material, factor):
     """A start with probability s loses 1 + g + g^2 + g^3 + g^4 shots; overlaps are of order s^2."""
     start, goes_on = 0.002, 0.25

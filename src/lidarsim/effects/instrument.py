@@ -114,7 +114,7 @@ class LostShots(Effect):
         goes_on: Probability that the next shot is lost as well, in [0, 1).
     """
 
-    upright: float = 1.5
+    upright: float = 1.2
     rough: float = 10.0
     goes_on: float = 0.25
 

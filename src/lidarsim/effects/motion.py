@@ -94,11 +94,16 @@ class FoliageOcclusion(Effect):
 
         p(s) = k exp(-k s)        mean depth 1 / k
 
-    and a ray that leaves the solid before that depth continues. Leaves sit in clumps, so k is not
-    the same everywhere: the depths of neighbouring rays are multiplied by ``exp(a g - a^2 / 2)``
-    with a Gaussian field g of unit variance over beams and shots. Its widths were chosen for holes
-    in leaves that are as alike as in a few scans of KITTI (correlation 0.4, 0.25 and 0.15 at one,
-    two and four shots). Every ray draws a depth; only those that meet leaves use it.
+    and a ray that leaves the solid before that depth continues. Leaves sit in clumps, so
+    neighbouring rays get about as deep, and k is not the same everywhere. With a Gaussian field g
+    of unit variance over beams and shots and a draw n of each ray::
+
+        s = -ln(1 - Phi(r g + sqrt(1 - r^2) n)) exp(a g - a^2 / 2) / k
+
+    The widths of g were chosen for holes in leaves that are as alike as in a few scans of KITTI
+    (correlation 0.4, 0.25 and 0.15 at one, two and four shots), r and a for the share of
+    neighbouring shots that differ by more than 0.5 m at one, two and four shots. Every ray draws a
+    depth; only those that meet leaves use it.
     """
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:

@@ -23,7 +23,7 @@ _GUTTER_M = (0.5, 0.9)
 _PARKING_M = 2.1
 # Bins are emptied on one working day of five.
 _COLLECTION_DAYS = 0.2
-_RISE = (-0.02, 0.035)
+_RISE = (-0.022, 0.03)
 # A cross slope that bends on a hill have left dies away by this factor from block to block.
 _LEVELLING = 0.93
 _BLOCKS_PER_TABLE = 32

@@ -47,7 +47,7 @@ def build_kerbside(builder: Builder, draw: Generator, side: float, district: Gen
     # A lamp every 20 to 40 m, on the left and on the right in turn.
     if (builder.section.block + (side > 0)) % 2 == 0 or draw.random() < 0.15:
         street_lamp(builder, draw, start + draw.uniform(4, 20), by_kerb, side)
-    if draw.random() < 0.3:
+    if draw.random() < 0.2:
         sign(builder, draw, start + draw.uniform(0, BLOCK_M), by_kerb, side)
     if draw.random() < tree_share:
         for s in (start + draw.uniform(2, 9), start + draw.uniform(13, 21)):
@@ -112,7 +112,7 @@ def build_corner(builder: Builder, draw: Generator, side: float) -> None:
         at = (middle + corner * draw.uniform(5.0, 6.5), side * (kerb.edge_m + _POST_M))
         if lit:
             traffic_light(builder, draw, *at, side)
-        elif draw.random() < 0.6:
+        elif draw.random() < 0.4:
             sign(builder, draw, *at, side)
         if draw.random() < 0.2:
             street_lamp(builder, draw, at[0] + corner, at[1], side)

@@ -231,6 +231,8 @@ def _fields(builder: Builder, draw: Generator, start: float, side: float, edge_m
     for _ in range(int(draw.poisson(9.0))):
         at = side * (edge_m + draw.uniform(8, 28))
         shrub(builder, draw, start + draw.uniform(0, BLOCK_M), at)
+    if draw.random() < 0.3:
+        hedge(builder, draw, side * (edge_m + 4.0), start, start + BLOCK_M)
     for away_m in (3.0, 12.0, 18.0):
         if draw.random() < 0.35:
             fence(builder, draw, side * (edge_m + away_m), start, start + BLOCK_M)
