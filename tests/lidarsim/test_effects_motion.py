@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import sweeps
+from scipy.special import ndtr
 from sweeps import applied, box
 
 from lidarsim.effects import (
@@ -110,11 +111,14 @@ def test_an_actor_that_crosses_is_sheared():
 
 
 def test_foliage_lets_rays_in_by_one_over_the_extinction():
-    """Mean penetration 1 / k of a deep medium; through a thin one pass exp(-k L / f) of the rays.
+    """Mean penetration 1 / k of a deep medium; of a thin one, the share of depths beyond it.
 
-    The factor f = exp(a g - a^2 / 2) of clumps has the mean 1; g is a standard normal.
+    Depths are -ln(1 - Phi(r g + sqrt(1 - r^2) n)) exp(a g), scaled to the mean 1 / k.
     """
-    k = 1.25
+    k, alike = 1.25, motion._ALIKE
+    g, n = np.random.default_rng(0).standard_normal((2, 400_000))
+    drawn = -np.log(ndtr(-alike * g - np.sqrt(1 - alike**2) * n)) * np.exp(motion._CLUMP_SPREAD * g)
+    drawn /= k * drawn.mean()
     deep = wall(30, 0, (15, 60, 9), extinction_per_m=k)
     sweep = swept(Scene((deep,)), FoliageOcclusion())
     straight = np.abs(azimuth_of(sweep)[LEVEL]) < np.radians(40)
@@ -123,8 +127,8 @@ def test_foliage_lets_rays_in_by_one_over_the_extinction():
     depth = sweep.grid(sweep.first.range_m)[LEVEL] - 15 / slope[0]
     depth = depth[straight & hit]
     assert len(depth) > 400
-    # Variance of exponentials times f, over some 8 rays of one clump that are alike.
-    error = np.sqrt(2 * np.exp(motion._CLUMP_SPREAD**2) - 1) / k / np.sqrt(len(depth) / 8)
+    # Some 8 rays of one clump are alike.
+    error = drawn.std() / np.sqrt(len(depth) / 8)
     assert depth.mean() == pytest.approx(1 / k, abs=3 * error)
     assert (sweep.grid(sweep.first.origin)[LEVEL][hit] == Origin.FOLIAGE).all()
 
@@ -133,8 +137,7 @@ def test_foliage_lets_rays_in_by_one_over_the_extinction():
     ahead = np.abs(azimuth_of(sweep)) < np.radians(5)
     ahead[28:] = False  # lower beams meet the ground
     through = (sweep.grid(sweep.first.surface) != 0)[ahead].mean()
-    g, spread = np.random.default_rng(0).standard_normal(100_000), motion._CLUMP_SPREAD
-    expected = np.exp(-k / np.exp(spread * g - spread**2 / 2)).mean()
+    expected = (drawn > 1).mean()
     assert through == pytest.approx(expected, abs=4 * np.sqrt(0.25 / (ahead.sum() / 8)))
 
 

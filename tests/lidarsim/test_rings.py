@@ -14,7 +14,7 @@ from lidarsim.weather import Weather
 def simulated(model, shots):
     """Points of a scan, and the laser of each, by their place: a laser ends where azimuth falls."""
     sensor = load_sensor(model, shots=shots)
-    scene = Street(5, 1, Conditions()).scene(3, sensor.mount_height_m)
+    scene = Street(5, 0, Conditions()).scene(3, sensor.mount_height_m)
     points = simulate_scan(scene, sensor, ("rings",), {"rolling_shutter": "off"}).points[:, :3]
     azimuth = np.arctan2(points[:, 1], points[:, 0]) % (2 * np.pi)
     return points.copy(), np.append(0, (np.diff(azimuth) < -1).cumsum())

@@ -198,7 +198,7 @@ def test_a_single_intensity_does_not_set_the_scale(scan, full, unit, factor):
     values[7] = factor * full
     odd = scale_of(values)
     assert unit in odd.text
-    assert odd.full == pytest.approx(plain.full, rel=1e-3)
+    assert odd.full == pytest.approx(plain.full, abs=0.0101 * full)  # a quantile moves by one step
 
 
 @pytest.mark.parametrize("kind", ["u1", "i4"])

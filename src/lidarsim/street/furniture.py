@@ -199,7 +199,7 @@ def planter(builder: Builder, draw: Generator, s: float, lateral: float) -> None
     builder.solid(
         Shape.ELLIPSOID, (s, lateral), (broad_m, broad_m, high_m), Semantic.VEGETATION,
         Material.FOLIAGE, LEAVES, builder.new_instance(), tall_m - 0.2 * high_m,
-        extinction_per_m=draw.uniform(3.0, 6.0),
+        extinction_per_m=draw.uniform(1.8, 3.5),
     )  # fmt: skip
 
 

@@ -16,7 +16,7 @@ from lidarsim.street.trees import LEAVES, clump, garden_tree, grass, tuft
 
 # A clipped hedge stops a beam within a decimetre, as those of real scans do; a free one within two
 # or three.
-_CLIPPED_PER_M, _FREE_PER_M = (9.0, 16.0), (3.5, 9.0)
+_CLIPPED_PER_M, _FREE_PER_M = (5.5, 9.5), (2.1, 5.3)
 # Openings for people and for cars.
 _PATH_M, _DRIVE_M = (0.9, 1.3), (2.7, 3.4)
 # A front garden has a plant per this many square metres, and at most so many.
@@ -386,7 +386,7 @@ def verge(
     """Tall grass with tufts and single tall weeds between two distances from the axis."""
     deep_m = draw.uniform(0.05, 0.14)
     across = (side * near_m, side * far_m)
-    grass(builder, (first, last), across, deep_m, draw.uniform(2.0, 5.0))
+    grass(builder, (first, last), across, deep_m, draw.uniform(1.2, 3.0))
     wanted = draw.poisson((last - first) * (far_m - near_m) / _TUFT_M2)
     for _ in range(min(int(wanted), _MOST_TUFTS)):
         s, lateral = draw.uniform(first, last), side * draw.uniform(near_m, far_m)

@@ -20,10 +20,10 @@ _BARK = 0.15
 # Chance of a hit per metre. Real crowns and edges of woods return from a shell whose neighbouring
 # shots differ by a decimetre, but by more than 0.5 m in every seventh pair: clumps are dense, and
 # single leaves and twigs stand around and between them.
-_CLUMP_PER_M = (2.5, 7.0)
-_TWIGS_PER_M = (0.2, 0.5)
-_SCREEN_PER_M = (2.0, 4.0)
-_NEEDLES_PER_M = (3.0, 8.0)
+_CLUMP_PER_M = (1.5, 4.1)
+_TWIGS_PER_M = (0.12, 0.3)
+_SCREEN_PER_M = (1.2, 2.4)
+_NEEDLES_PER_M = (1.8, 4.7)
 # Clear stems: 2.5 m above pavements where it is pruned, less where it is not.
 _STREET_STEM_M, _LOW_STEM_M = (2.1, 3.0), (1.6, 2.1)
 # A low crown is cut back at the kerb, where cars pass.
@@ -72,7 +72,7 @@ def tuft(builder: Builder, draw: Generator, s: float, lateral: float, tall_m: fl
     size = (wide_m, wide_m * draw.uniform(0.6, 1.0), 1.4 * tall_m)
     builder.solid(
         Shape.ELLIPSOID, (s, lateral), size, Semantic.TERRAIN, Material.FOLIAGE, LEAVES, 0,
-        -0.4 * tall_m, draw.uniform(0, math.pi), False, draw.uniform(3.0, 8.0),
+        -0.4 * tall_m, draw.uniform(0, math.pi), False, draw.uniform(1.8, 4.7),
     )  # fmt: skip
 
 
@@ -247,7 +247,7 @@ def wood_edge(builder: Builder, draw: Generator, s: float, lateral: float) -> No
     dusk_m = (1.1 * BLOCK_M, 12.0, 11.0)
     builder.solid(
         Shape.ELLIPSOID, (s, lateral + 6.5 * away), dusk_m, Semantic.VEGETATION, Material.FOLIAGE,
-        LEAVES, instance, -4.0, extinction_per_m=draw.uniform(0.3, 0.6),
+        LEAVES, instance, -4.0, extinction_per_m=draw.uniform(0.18, 0.36),
     )  # fmt: skip
 
     def place(number: int, count: int, inwards_m: float) -> Place:
@@ -279,7 +279,7 @@ def meadow(builder: Builder, draw: Generator, side: float, edge_m: float) -> Non
     start = builder.section.block * BLOCK_M
     across = (side * (edge_m + 1.5), side * (edge_m + 19.5))
     deep_m = draw.uniform(0.05, 0.15)
-    grass(builder, (start, start + BLOCK_M), across, deep_m, draw.uniform(1.5, 4.0))
+    grass(builder, (start, start + BLOCK_M), across, deep_m, draw.uniform(0.9, 2.4))
     for _ in range(int(draw.poisson(_TUFTS_PER_MEADOW))):
         place = (start + draw.uniform(0, BLOCK_M), side * (edge_m + draw.uniform(1.5, 14.0)))
         tuft(builder, draw, *place, deep_m + draw.uniform(0.15, 0.6))
