@@ -32,7 +32,7 @@ _DRIVE_M = 4.0
 # Behind the houses stands a tree on each so many metres of street.
 _BACK_TREE_M = 4.0
 # Trees in the front garden of a detached house, on average.
-_FRONT_TREES = 2.5
+_FRONT_TREES = 1.7
 # Parked at right angles on a car park: places of 2.5 m and some room.
 _SLOT_M = 2.8
 # Depth of a car park along the street: a row of cars and the lane behind it.
@@ -137,7 +137,7 @@ def _side_garden(
     wide_m = last - first
     if wide_m < 1.5:
         return
-    for away_m in draw.uniform(1, 16, 7):
+    for away_m in draw.uniform(1, 16, 5):
         shrub(builder, draw, draw.uniform(first, last), side * (front_m + away_m))
     for away_m in (draw.uniform(1, 4), draw.uniform(5, 14)):
         if draw.random() < 0.6:
@@ -172,7 +172,7 @@ def _blocks(builder: Builder, draw: Generator, start: float, side: float, edge_m
     front_garden(builder, draw, side, start, end, edge_m + 0.8, front_m - 0.5)
     if draw.random() < 0.5:
         hedge(builder, draw, side * (edge_m + 0.5), start, end - draw.uniform(2, 10))
-    for _ in range(3 + int(draw.poisson(3.0))):
+    for _ in range(2 + int(draw.poisson(2.5))):
         garden_tree(
             builder, draw, draw.uniform(start, end), side * (edge_m + draw.uniform(2, setback_m))
         )
@@ -186,7 +186,7 @@ def _green(builder: Builder, draw: Generator, start: float, side: float, edge_m:
         border(builder, draw, side * (edge_m + 0.5), start, start + BLOCK_M)
     else:
         verge(builder, draw, side, start, start + BLOCK_M, edge_m, edge_m + 3.0)
-    for _ in range(int(draw.poisson(12.0))):
+    for _ in range(int(draw.poisson(8.0))):
         at = side * (edge_m + draw.uniform(4, 26))
         shrub(builder, draw, start + draw.uniform(0, BLOCK_M), at)
     for _ in range(int(draw.poisson(15.0))):
@@ -228,7 +228,7 @@ def _fields(builder: Builder, draw: Generator, start: float, side: float, edge_m
     for _ in range(int(draw.poisson(3.5))):
         at = side * (edge_m + draw.uniform(1.5, 24))
         garden_tree(builder, draw, start + draw.uniform(0, BLOCK_M), at)
-    for _ in range(int(draw.poisson(9.0))):
+    for _ in range(int(draw.poisson(7.0))):
         at = side * (edge_m + draw.uniform(8, 28))
         shrub(builder, draw, start + draw.uniform(0, BLOCK_M), at)
     if draw.random() < 0.3:

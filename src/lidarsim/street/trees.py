@@ -29,7 +29,7 @@ _STREET_STEM_M, _LOW_STEM_M = (2.1, 3.0), (1.6, 2.1)
 # A low crown is cut back at the kerb, where cars pass.
 _LOW_CROWN_M = (1.8, 3.0)
 # Per 18 m of the edge of a wood; of its trunks those before the leaves.
-_WOOD_SCREENS, _WOOD_TRUNKS, _WOOD_CROWNS, _WOOD_SHRUBS = 2, 12, 12, 12
+_WOOD_SCREENS, _WOOD_TRUNKS, _WOOD_CROWNS, _WOOD_SHRUBS = 2, 12, 8, 8
 _TUFTS_PER_MEADOW = 7
 
 
@@ -125,7 +125,8 @@ def _crown(
         across_m = wide_m * draw.uniform(0.22, 0.42)
         piece_m = (across_m, across_m * draw.uniform(0.7, 1.0), tall_m * draw.uniform(0.3, 0.5))
         bottom_m = low_m + tall_m * draw.uniform(0.0, 0.3)
-        clump(builder, draw, place, piece_m, bottom_m, instance, _CLUMP_PER_M)
+        is_detail = number % 2 == 1
+        clump(builder, draw, place, piece_m, bottom_m, instance, _CLUMP_PER_M, is_detail)
 
 
 def _broadleaf(
@@ -267,11 +268,13 @@ def wood_edge(builder: Builder, draw: Generator, s: float, lateral: float) -> No
     for number in range(_WOOD_CROWNS):
         at = place(number, _WOOD_CROWNS, draw.uniform(-3.5, 1.5))
         size = (draw.uniform(1.2, 3.0), draw.uniform(1.2, 3.0), draw.uniform(1.5, 4.0))
-        clump(builder, draw, at, size, draw.uniform(0.3, 3.0), instance, _CLUMP_PER_M)
+        bottom_m, is_detail = draw.uniform(0.3, 3.0), number % 2 == 1
+        clump(builder, draw, at, size, bottom_m, instance, _CLUMP_PER_M, is_detail)
     for number in range(_WOOD_SHRUBS):
         at = place(number, _WOOD_SHRUBS, draw.uniform(-5.0, 0.0))
         size = (draw.uniform(0.8, 3.0), draw.uniform(1.0, 2.5), draw.uniform(1.0, 3.0))
-        clump(builder, draw, at, size, -0.3 * size[2], instance, _CLUMP_PER_M)
+        is_detail = number % 2 == 1
+        clump(builder, draw, at, size, -0.3 * size[2], instance, _CLUMP_PER_M, is_detail)
 
 
 def meadow(builder: Builder, draw: Generator, side: float, edge_m: float) -> None:
