@@ -68,7 +68,19 @@ def test_scenes_without_them_say_so(tmp_path):
 
 def test_sample_writes_labels_and_intensity(labelled, tmp_path):
     words = ["sample", "--ckpt", labelled, "--out", tmp_path / "out", "--num", 2, "--steps", 2]
-    main([*map(str, words), "--solver", "euler", "--pictures", "1", "--device", "cpu"])
+    main(
+        [
+            *map(str, words),
+            "--solver",
+            "euler",
+            "--shift",
+            "1",
+            "--pictures",
+            "1",
+            "--device",
+            "cpu",
+        ]
+    )
     scenes = SceneGenerator.from_checkpoint(labelled, TWO_STEPS, device="cpu").generate(2)
     for index in range(2):
         points = read_scan(tmp_path / "out" / "bin" / f"{index:06d}.bin")

@@ -89,7 +89,8 @@ def start(tmp_path, caplog):
     """``start(configs, settings)`` runs ``r3dpa fit`` for one batch."""
 
     def start(configs, settings):
-        words = [word for name in configs for word in ("--config", str(CONF / f"{name}.yaml"))]
+        files = [name if isinstance(name, Path) else CONF / f"{name}.yaml" for name in configs]
+        words = [word for path in files for word in ("--config", str(path))]
         words += [f"--{key}={value}" for key, value in (QUIET | settings).items()]
         main(["fit", *words, f"--run_dir={tmp_path / 'run'}"])
         assert "`Trainer.fit` stopped: `max_steps=1` reached" in caplog.text
@@ -134,7 +135,13 @@ def test_experiments_with_tiny_networks(experiment, data, start, smoke_root, tmp
     configs = ["trainer", f"data/{data}", f"experiment/{stage}"]
     if folder == "demo":
         configs += ["demo/trainer", experiment]
-    configs += ["smoke", f"data/{data}"]  # again, in place of the data of smoke.yaml
+    smoke = yaml.safe_load((CONF / "smoke.yaml").read_text())
+    smoke_file = "smoke"
+    if stage == "joint_unet":  # whose network has other arguments
+        smoke["model"]["init_args"]["sit"] = {"init_args": TINY_UNET}
+        smoke_file = tmp_path / "smoke.yaml"
+        smoke_file.write_text(yaml.safe_dump(smoke))
+    configs += [smoke_file, f"data/{data}"]  # again, in place of the data of smoke.yaml
     settings = {
         f"data.init_args.{'scans' if 'folder' in data else 'root'}": smoke_root,
         "data.init_args.sensor": "{beams: 16, columns: 64}",
@@ -144,18 +151,14 @@ def test_experiments_with_tiny_networks(experiment, data, start, smoke_root, tmp
     if data in ("demo", "simulated"):
         settings |= SIMULATED
     if stage in ("flow_matching", "few_step"):
-        smoke = yaml.safe_load((CONF / "smoke.yaml").read_text())["model"]["init_args"]
-        sit = smoke["sit"]["init_args"] if stage == "few_step" else None
-        settings |= start_flow(tmp_path, smoke["vae"]["init_args"], (16, 64), sit)
+        networks = smoke["model"]["init_args"]
+        sit = networks["sit"]["init_args"] if stage == "few_step" else None
+        settings |= start_flow(tmp_path, networks["vae"]["init_args"], (16, 64), sit)
     if stage == "few_step":
         settings |= {
             "model.init_args.sit.init_args.average_blocks": 1,
             "model.init_args.thin_decoder.init_args": json.dumps(THIN_DECODER),
         }
-    if stage == "joint_unet":
-        settings["model.init_args.sit"] = json.dumps(
-            {"class_path": "r3dpa.nn.UNet", "init_args": TINY_UNET}
-        )
     start(configs, settings)
 
 

@@ -158,7 +158,7 @@ def test_common_names_of_options():
     [
         (["sam"], ["sample"]),
         (["edit", ""], ["inpaint", "mix", "complete", "vary", "interpolate"]),
-        (["fit", "joi"], ["joint"]),
+        (["fit", "joi"], ["joint", "joint_unet"]),
         (["fit", "joint", "--pres"], ["--preset"]),
         (["sample", "--qua"], ["--quality"]),
         (["view", "--nu"], ["--num"]),

@@ -32,7 +32,7 @@ def scans(tmp_path_factory):
     for frame in range(5):
         azimuth = generator.uniform(-np.pi, np.pi, 400)
         points = np.stack(
-            [8 * np.cos(azimuth), 8 * np.sin(azimuth), -1.7 + 0 * azimuth, azimuth / 8]
+            [8 * np.cos(azimuth), 8 * np.sin(azimuth), -1.7 + 0 * azimuth, np.abs(azimuth) / 8]
         )
         points = points.T * generator.uniform(0.5, 2, (400, 1))
         (folder / f"{frame:010d}.bin").write_bytes(points.astype(np.float32).tobytes())

@@ -141,7 +141,7 @@ def test_cached_trajectories_are_those_of_flow_seed_and_precision(monkeypatch, t
             "tensor_cache",
             lambda root, kind, settings, *_: seen.append(settings) or SimpleNamespace(folder=root),
         )
-        monkeypatch.setattr(few_step, "filled", lambda *_: None)
+        monkeypatch.setattr(few_step, "fill_cache", lambda *_: None)
         module._trainer = SimpleNamespace(
             precision=precision,
             fast_dev_run=False,

@@ -12,14 +12,14 @@ from r3dpa.cli.parser import check_file, check_folder
 from r3dpa.pretrained import DEFAULT_WEIGHTS, check_features
 
 
-def check(path: Path, *, columns: tuple[str, ...] = ()) -> None:
+def check(folder: Path, *, columns: tuple[str, ...] = ()) -> None:
     """List every bad scan and missing folder of a data set; exit with 1 if there is any.
 
     Says which columns scans hold, which beams they show and how sure that is, which files were
     skipped, and whether points are in the frame of the vehicle.
 
     Args:
-        path: Root in the KITTI-360 layout, or a folder of scans of any format that can be read.
+        folder: Root in the KITTI-360 layout, or a folder of scans of any format that can be read.
         columns: Columns of files without names, such as ``x,y,z,intensity,ring``; default: by the
             values.
     """
@@ -29,18 +29,18 @@ def check(path: Path, *, columns: tuple[str, ...] = ()) -> None:
     from r3dpa.data.scans import RAW, evenly, scan_files
     from r3dpa.data.scans import check as check_scans
 
-    is_layout = (path / RAW).is_dir()
-    files = list(scan_files(path)) if path.exists() else []
+    is_layout = (folder / RAW).is_dir()
+    files = list(scan_files(folder)) if folder.exists() else []
     kitti = [file for file in sorted(files) if suffix_of(file) == ".bin" and not columns]
     lines: list[str] = []
     text, others, usable = "", list[Path](), True
     if not kitti and not is_layout:
         try:
-            others = find_files(path)[1]
+            others = find_files(folder)[1]
         except ScanError as error:
             lines.append(f"bad: {error}")
     if not others:
-        text, usable = check_scans(path)
+        text, usable = check_scans(folder)
     for file in others or evenly(kitti, 4):
         try:
             cloud = read_cloud(file, columns)
@@ -49,7 +49,7 @@ def check(path: Path, *, columns: tuple[str, ...] = ()) -> None:
         except ScanError as error:
             lines += [] if text else [f"bad: {error}"]
             usable = usable and bool(text)
-    if not is_layout and (line := skipped_files(files_below(path), others or kitti)):
+    if not is_layout and (line := skipped_files(files_below(folder), others or kitti)):
         lines.append(line)
     sys.stdout.write("\n".join([*lines, *([text] if text else []), ""]))
     if not usable:
