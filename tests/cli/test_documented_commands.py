@@ -10,6 +10,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import tomllib
 import zipfile
 from pathlib import Path
 
@@ -21,6 +22,8 @@ from r3dpa.cli.parser import load, parse
 
 TOP = Path(__file__).resolve().parents[2]
 CONF = TOP / "conf"
+PYPROJECT = TOP / "pyproject.toml"
+EXTRAS = tomllib.loads(PYPROJECT.read_text())["project"]["optional-dependencies"]
 # Given to `test` and `predict` in place of the configuration of a run that is not there.
 JOINT = [CONF / f"{name}.yaml" for name in ("trainer", "data/simulated", "experiment/joint")]
 
@@ -107,7 +110,11 @@ def test_other_command_exists(words):
         subprocess.run(["make", "--dry-run", *words[1:]], cwd=TOP, check=True, capture_output=True)
     elif words[0] == ".venv/bin/pytest":
         assert words[1] == "-m"
-        assert f'"{words[2]}:' in (TOP / "pyproject.toml").read_text()
+        assert f'"{words[2]}:' in PYPROJECT.read_text()
+    elif words[:2] == ["pip", "install"]:
+        extras = re.fullmatch(r"(?:\.|r3dpa)(?:\[([\w,]+)\])?", words[2])
+        assert words[2] == "torch" or extras
+        assert not extras or not extras[1] or set(extras[1].split(",")) <= set(EXTRAS)
     else:
         assert words in ([".", ".venv/bin/activate"], ["matplotlib", "inline"])
 

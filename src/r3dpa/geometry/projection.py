@@ -49,7 +49,8 @@ class SphericalProjection:
         legacy_hiding: Let points outside the range limits hide those behind them, as R2DM does.
 
     Example:
-        >>> row, column = SphericalProjection(LidarSensor()).pixel_of(torch.tensor([10.0, 0.0, 0.0]))
+        >>> projection = SphericalProjection(LidarSensor())
+        >>> row, column = projection.pixel_of(torch.tensor([10.0, 0.0, 0.0]))
         >>> row.item(), column.item()
         (6, 512)
     """

@@ -28,7 +28,8 @@ class EMA(nn.Module):
 
     Example:
         >>> from r3dpa.nn import SiT
-        >>> sit = SiT((4, 8), in_channels=2, hidden_size=32, depth=2, num_heads=2, alignment_depth=1)
+        >>> small = {"hidden_size": 32, "depth": 2, "num_heads": 2, "alignment_depth": 1}
+        >>> sit = SiT((4, 8), in_channels=2, **small)
         >>> norm = LatentNorm(channels=2)
         >>> ema = EMA(sit, norm, decay=0.5)
         >>> with torch.no_grad():

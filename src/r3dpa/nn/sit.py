@@ -96,7 +96,8 @@ class SiT(VelocityNetwork):
             et al. 2025), which takes neither ``projector_dim`` nor official weights.
 
     Example:
-        >>> sit = SiT((4, 8), in_channels=2, hidden_size=32, depth=2, num_heads=2, alignment_depth=1)
+        >>> small = {"hidden_size": 32, "depth": 2, "num_heads": 2, "alignment_depth": 1}
+        >>> sit = SiT((4, 8), in_channels=2, **small)
         >>> tuple(sit.velocity(torch.randn(3, 2, 4, 8), torch.tensor([0.0, 0.5, 1.0])).shape)
         (3, 2, 4, 8)
     """
