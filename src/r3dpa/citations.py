@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from importlib.resources import files
-from typing import TYPE_CHECKING
 
 from r3dpa.pretrained import DEFAULT_WEIGHTS
-
-if TYPE_CHECKING:
-    from r3dpa.checkpoints import Checkpoint
 
 # Keys of citations.bib by what a checkpoint states.
 _OF_STAGE = {
@@ -34,16 +31,20 @@ def cite(ckpt: str = DEFAULT_WEIGHTS) -> str:
     """
     from r3dpa.checkpoints import read_checkpoint
 
+    checkpoint = read_checkpoint(ckpt)
+    classes = [state.class_path.rpartition(".")[2] for state in checkpoint.networks.values()]
+    keys = keys_of(checkpoint.stage, classes, checkpoint.feature_source, checkpoint.sampling)
     entries = files("r3dpa").joinpath("citations.bib").read_text().strip()
     by_key = {re.split(r"[{,]", entry, maxsplit=2)[1]: entry for entry in entries.split("\n\n")}
-    return "\n\n".join(by_key[key] for key in _keys(read_checkpoint(ckpt)))
+    return "\n\n".join(by_key[key] for key in keys)
 
 
-def _keys(checkpoint: Checkpoint) -> list[str]:
-    keys = list(_OF_STAGE.get(checkpoint.stage, ["r3dpa"]))
-    for network in checkpoint.networks.values():
-        name = network.class_path.rpartition(".")[2]
-        keys += [_OF_NETWORK[name]] if name in _OF_NETWORK else []
-    keys += _OF_FEATURES.get(checkpoint.feature_source or "", [])
-    keys += ["perturbed_attention"] if "perturbed_attention" in checkpoint.sampling else []
+def keys_of(
+    stage: str, classes: Iterable[str], features: str | None, sampling: Iterable[str]
+) -> list[str]:
+    """Return the keys of ``citations.bib`` for a stage, network classes, features and guidance."""
+    keys = list(_OF_STAGE.get(stage, ["r3dpa"]))
+    keys += [_OF_NETWORK[name] for name in classes if name in _OF_NETWORK]
+    keys += _OF_FEATURES.get(features or "", [])
+    keys += [name for name in sampling if name == "perturbed_attention"]
     return list(dict.fromkeys(keys))
