@@ -6,6 +6,8 @@ TORCH ?= torch==2.13.0
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.installed
+LOWEST := .venv-lowest
+DEFAULT_TESTS := "not slow and not gpu and not weights and not bench"
 
 # What `make demo` reads: simulated scans, or every .bin below DATA. SCRATCH=1 trains small networks
 # from nothing instead of starting from the weights of the package.
@@ -35,8 +37,8 @@ R3DPA_S_FIT := nice -n 19 $(BIN)/r3dpa fit --config conf/trainer.yaml --config c
 	--config conf/r3dpa_s/data.yaml --ckpt_path last
 
 .DEFAULT_GOAL := help
-.PHONY: help install format lint types test test-all test-numerics \
-	test-faults test-nodes fuzz notebooks demo gallery r3dpa-s r3dpa-s-scores clean bench bench-training \
+.PHONY: help install format lint types test test-lowest test-all test-numerics \
+	test-faults test-nodes fuzz notebooks demo gallery r3dpa-s r3dpa-s-scores docs clean bench bench-training \
 	bench-sampling bench-gpu ablations
 
 help: ## list the targets
@@ -64,7 +66,14 @@ types: $(READY) ## mypy alone
 
 # Bytecode is kept, or every process would compile all files again.
 test: $(READY) ## default tests, a few minutes on two cores
-	OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n 2 --dist worksteal -p no:nbmake -m "not slow and not gpu and not weights and not bench"
+	OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n 2 --dist worksteal -p no:nbmake -m $(DEFAULT_TESTS)
+
+# Lower bounds of pyproject.toml as constraints, in an environment of its own.
+test-lowest: ## default tests with the lowest versions that pyproject.toml allows
+	test -x $(LOWEST)/bin/python || $(PYTHON) -m venv $(LOWEST)
+	$(LOWEST)/bin/python tests/lowest_versions.py dev hub > $(LOWEST)/constraints.txt
+	$(LOWEST)/bin/pip install --quiet --constraint $(LOWEST)/constraints.txt --editable ".[dev,hub]"
+	OMP_NUM_THREADS=1 $(LOWEST)/bin/pytest -n 2 --dist worksteal -p no:nbmake -m $(DEFAULT_TESTS)
 
 test-all: $(READY) ## every test that this machine can run
 	$(BIN)/pytest
@@ -160,5 +169,8 @@ bench-gpu: $(READY) ## on a GPU: training steps at full size, and sampling from 
 		--out runs/bench_gpu/training.json
 	$(if $(CKPT),$(BIN)/r3dpa bench sampling --device cuda --ckpt $(CKPT) --out runs/bench_gpu/sampling)
 
+docs: $(READY) ## API pages in build/docs
+	$(BIN)/python docs/api.py build/docs
+
 clean: ## remove caches and runs, keep .venv
-	rm -rf runs .pytest_cache .mypy_cache .ruff_cache
+	rm -rf runs build .pytest_cache .mypy_cache .ruff_cache

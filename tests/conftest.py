@@ -28,9 +28,11 @@ def pytest_addoption(parser):
 
 
 def pytest_ignore_collect(collection_path, config):
-    """Micro-benchmarks are collected for `-m bench` alone."""
+    """Micro-benchmarks are collected for `-m bench` alone; helpers have no doctests."""
+    name = collection_path.name
+    is_helper = name.endswith(".py") and not name.startswith(("test_", "bench_"))
     wanted = config.getoption("markexpr") == "bench"
-    return True if collection_path.name.startswith("bench_") and not wanted else None
+    return True if is_helper or (name.startswith("bench_") and not wanted) else None
 
 
 def pytest_collection_finish():

@@ -29,6 +29,7 @@ ALLOWED = {
     "checkpoints": {"geometry", "nn", "pretrained", "class_paths"},
     # A batch of scenes writes its files and shows its pages.
     "scenes": {"geometry", "data", "lidarsim", "viz"},
+    "citations": {"checkpoints", "pretrained"},
     "scheduled_velocity": {"flow", "nn"},
     "generation": {"geometry", "nn", "flow", "checkpoints", "scenes", "scheduled_velocity"},
     "scene_vae": {"geometry", "nn", "generation", "checkpoints", "scenes"},

@@ -1,4 +1,4 @@
-"""The Python of the README runs, one block after the other, in a folder with the files it names."""
+"""The Python of the README runs in a folder with the files it names; paths in documents exist."""
 
 from __future__ import annotations
 
@@ -6,13 +6,15 @@ import re
 from pathlib import Path
 
 import numpy as np
+import pytest
 from tiny_networks import tiny_checkpoint
 
 from r3dpa import pretrained
 from r3dpa.data import write_bin
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
 
-README = Path(__file__).resolve().parents[1] / "README.md"
+TOP = Path(__file__).resolve().parents[1]
+README = TOP / "README.md"
 
 
 def test_python_of_the_readme_runs(tmp_path, monkeypatch):
@@ -31,3 +33,18 @@ def test_python_of_the_readme_runs(tmp_path, monkeypatch):
     assert names["scenes"].range_m.shape[0] == 4
     assert names["jsd"] == 0
     assert names["image_m"].shape == (64, 1024)
+
+
+@pytest.mark.parametrize(
+    "name", ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", "notebooks/LOG.md"]
+)
+def test_links_and_paths_of_documents_exist(name):
+    document = TOP / name
+    text = document.read_text()
+    for link in re.findall(r"\]\((?!https?:)([^)#]+)", text):
+        assert (document.parent / link).exists(), link
+    if name == "CONTRIBUTING.md":
+        roots = (TOP, TOP / "src", TOP / "src/r3dpa", TOP / "src/lidarsim")
+        for path in re.findall(r"`([\w.]+/[\w./]*)`", text):
+            built = path.startswith("build/")
+            assert built or any((root / path).exists() for root in roots), path

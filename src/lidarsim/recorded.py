@@ -64,6 +64,11 @@ class RecordedScan:
 
     Raises:
         ValueError: If there are no points, a column has another length, or points cannot be used.
+
+    Example:
+        >>> scan = RecordedScan(np.ones((5, 3), np.float32), intensity=np.zeros(5, np.float32))
+        >>> len(scan)
+        5
     """
 
     points: NDArray[np.float32]

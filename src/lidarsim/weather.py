@@ -378,6 +378,11 @@ class WeatherPrior:
         rain_mm_h: Least and largest rate.
         snow_mm_h: Least and largest rate, as water.
         instrument: Assumptions about the instrument.
+
+    Example:
+        >>> foggy = WeatherPrior(probability=1.0).draw(np.random.default_rng(0))
+        >>> round(foggy.visibility_m)
+        35
     """
 
     probability: float = 0.5

@@ -63,6 +63,14 @@ class SceneGenerator:
         ValueError: If the latent statistics were never fitted, ``batch_size`` is below 1,
             ``compile`` comes without it, or networks, geometry, guidance and sampler do not fit
             each other.
+
+    Example:
+        >>> generator = SceneGenerator.from_pretrained(
+        ...     "r3dpa-s", SamplerConfig("average_velocity", steps=1), device="cpu"
+        ... )
+        >>> scenes = generator.generate(1)
+        >>> tuple(scenes.range_m.shape), scenes.points(0).shape[1]
+        ((1, 64, 1024), 3)
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Every command line in README, notebooks, Makefile and the comments of ``conf`` is accepted.
+"""Every command line in Markdown, notebooks, Makefile and the comments of ``conf`` is accepted.
 
 An installed wheel holds the configurations, and its commands find them.
 """
@@ -10,6 +10,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import tomllib
 import zipfile
 from pathlib import Path
 
@@ -21,6 +22,8 @@ from r3dpa.cli.parser import load, parse
 
 TOP = Path(__file__).resolve().parents[2]
 CONF = TOP / "conf"
+PYPROJECT = TOP / "pyproject.toml"
+EXTRAS = tomllib.loads(PYPROJECT.read_text())["project"]["optional-dependencies"]
 # Given to `test` and `predict` in place of the configuration of a run that is not there.
 JOINT = [CONF / f"{name}.yaml" for name in ("trainer", "data/simulated", "experiment/joint")]
 
@@ -35,14 +38,29 @@ def commands_in(text):
                 yield words
 
 
-def documented():
-    found = {"README.md": (TOP / "README.md").read_text()}
+def documents():
+    """Texts for readers by name; of notebooks the sources of all cells."""
+    names = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "notebooks/LOG.md")
+    cards = ("src/r3dpa/weights/r3dpa-s.md", "src/r3dpa/features/README.md")
+    texts = {name: (TOP / name).read_text() for name in (*names, *cards)}
     for path in sorted((TOP / "notebooks").glob("*.ipynb")):
         cells = json.loads(path.read_text())["cells"]
-        text = "\n".join("".join(cell["source"]) for cell in cells)
-        found[path.name] = text
-        spans = re.findall(r"`(r3dpa [^`]*--[^`]+)`", text.replace("\n", " "))
-        found[path.name] += "\n" + "\n".join(spans)
+        texts[path.name] = "\n".join("".join(cell["source"]) for cell in cells)
+    return texts
+
+
+def spans_of(text, command):
+    """Code spans of Markdown that start with a command."""
+    prose = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
+    return re.findall(rf"`({command} [^`]+)`", prose.replace("\n", " "))
+
+
+def documented():
+    found = {}
+    for name, text in documents().items():
+        # A span without options only names a command.
+        complete = [s for s in spans_of(text, "r3dpa") if " --" in s and "--help" not in s]
+        found[name] = "\n".join([text, *complete])
     fit = "r3dpa fit --config conf/data/demo.yaml"
     make = re.sub(r"\$\((BOX_)?FIT\)", fit, (TOP / "Makefile").read_text())
     make = re.sub(r"\$\(BIN\)/|OMP_NUM_THREADS=1|\$\(if.*", "", make)
@@ -72,6 +90,42 @@ def test_command_is_accepted(words, monkeypatch, capsys):
         assert ended.value.code == 0, capsys.readouterr().err
     else:
         parse(load(COMMANDS[name].target), rest, name)
+
+
+def other_commands():
+    """Lines of shell blocks that do not start with ``r3dpa``, and ``make`` in code spans."""
+    for name, text in documents().items():
+        blocks = "\n".join(re.findall(r"```bash\n(.*?)```", text, re.DOTALL))
+        lines = blocks.replace("\\\n", " ").splitlines()
+        lines += re.findall(r"^[!%](.*)", text, re.MULTILINE) if name.endswith(".ipynb") else []
+        for line in [*lines, *spans_of(text, "make"), *spans_of(text, r"\.venv/bin/pytest")]:
+            words = shlex.split(line, comments=True)
+            if words and words[0] != "r3dpa":
+                yield pytest.param(words, id=f"{name}-{'-'.join(words[:2])}")
+
+
+@pytest.mark.parametrize("words", list(other_commands()))
+def test_other_command_exists(words):
+    if words[0] == "make":
+        subprocess.run(["make", "--dry-run", *words[1:]], cwd=TOP, check=True, capture_output=True)
+    elif words[0] == ".venv/bin/pytest":
+        assert words[1] == "-m"
+        assert f'"{words[2]}:' in PYPROJECT.read_text()
+    elif words[:2] == ["pip", "install"]:
+        extras = re.fullmatch(r"(?:\.|r3dpa)(?:\[([\w,]+)\])?", words[2])
+        assert words[2] == "torch" or extras
+        assert not extras or not extras[1] or set(extras[1].split(",")) <= set(EXTRAS)
+    else:
+        assert words in ([".", ".venv/bin/activate"], ["matplotlib", "inline"])
+
+
+def test_a_span_without_options_names_a_command():
+    groups = {name.split()[0] for name in COMMANDS}
+    for text in documents().values():
+        for span in spans_of(text, "r3dpa"):
+            words = span.split()[1:]
+            if words[0] not in {"COMMAND", "--help"} and words not in [[group] for group in groups]:
+                _find(words)
 
 
 def test_readme_shows_every_group():

@@ -334,8 +334,7 @@ def test_updates_stay_on_the_device(monkeypatch, name):
     """
     monkeypatch.setattr(functional, "checked_features", lambda x, *_: x.double())
     options = {"mmd": {"max_real": 1, "max_generated": 1}, "ranges": {"num_groups": 3}}
-    with torch.device("meta"):
-        metric = metric_of(name, **options.get(name, {}))
+    metric = metric_of(name, **options.get(name, {})).to("meta")
     shape = (2, 8, 32) if name in ("mmd", "ranges") else (2, 4)
     with OneDevice():
         for real in [True] * 40 + [False] * 40:

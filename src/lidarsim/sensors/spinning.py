@@ -78,6 +78,11 @@ class SpinningLidar:
 
     Source: KITTI's scans (laser table, nearest range, noise), the datasheet (other limits,
     divergence), KITTI-360 (mount, spin).
+
+    Example:
+        >>> sensor = load_sensor("hdl32e")
+        >>> sensor.num_beams, sensor.rays.direction.shape
+        (32, (3, 32, 2170))
     """
 
     lasers: Lasers

@@ -22,6 +22,11 @@ class LidarSensor:
         inclination_min_deg: Lower border of the last row, degrees above the horizon.
         range_min_m: Points at this distance or nearer are dropped, metres.
         range_max_m: Points at this distance or farther are dropped, metres.
+
+    Example:
+        >>> sensor = LidarSensor()
+        >>> sensor.cell_size((8, 64))
+        (8, 16)
     """
 
     beams: int = 64

@@ -46,6 +46,7 @@ COMMANDS = {
     "edit interpolate": Command("edit:interpolate", "generate the scenes between two scans"),
     "evaluate": Command("evaluate:evaluate", "compare samples of any generator with real scans"),
     "models": Command("r3dpa.pretrained:models", "list trained weights, or show their card"),
+    "cite": Command("r3dpa.citations:cite", "print BibTeX of what a checkpoint used"),
     "convert": Command("runs:convert", "convert checkpoints from and to the official layout"),
     "report": Command("runs:report", "draw the loss curves of a run and list the losses"),
     "replay": Command("replay:replay", "repeat a skipped step to find the layer that failed"),

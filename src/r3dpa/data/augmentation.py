@@ -28,6 +28,10 @@ class View:
     """A scan mirrored or not, then rotated by ``columns`` of the ``grid_columns`` w of its grid.
 
     Everything moves to the right, that is clockwise seen from above.
+
+    Example:
+        >>> View(columns=1, mirrored=False, grid_columns=4).image(torch.arange(4))
+        tensor([3, 0, 1, 2])
     """
 
     columns: int

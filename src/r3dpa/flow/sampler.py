@@ -44,6 +44,10 @@ class SamplerConfig:
     Raises:
         ValueError: If the solver is unknown, a number out of its range, or a setting other than its
             default is one that the solver does not read.
+
+    Example:
+        >>> SamplerConfig("heun", steps=8).nfe
+        15
     """
 
     solver: Solver = "euler_maruyama"

@@ -94,6 +94,14 @@ class RangeCodec:
         intensity_channel: Images have a channel of intensity; needs ``return_channel``.
         num_classes: Number of semantic classes, of which images have a channel; 0 for none. Needs
             ``return_channel``.
+
+    Example:
+        >>> codec = RangeCodec("linear", scale=56.0)
+        >>> image = codec.to_image(torch.tensor([[-1.0, 14.0]]))  # no return; 14 m
+        >>> image
+        tensor([[[-1.0000, -0.5000]]])
+        >>> codec.decode(image, LidarSensor())
+        tensor([[[-1., 14.]]])
     """
 
     encoding: Literal["linear", "log2", "inverse"] = "linear"
@@ -276,6 +284,11 @@ class ScanGeometry:
         projection: Points to pixels and back, with its sensor.
         codec: Metres to [-1, 1] and back.
         grid_size: Rows and columns of the feature grid.
+
+    Example:
+        >>> geometry = ScanGeometry(SphericalProjection(LidarSensor()), RangeCodec(), (8, 64))
+        >>> ScanGeometry.from_dict(geometry.to_dict()) == geometry
+        True
     """
 
     projection: Projection

@@ -47,6 +47,12 @@ class SphericalProjection:
         legacy_seam: Put points with an azimuth of exactly -pi (y = -0.0 behind the sensor) into
             the last column, as the official code does, and not beside those with +pi.
         legacy_hiding: Let points outside the range limits hide those behind them, as R2DM does.
+
+    Example:
+        >>> projection = SphericalProjection(LidarSensor())
+        >>> row, column = projection.pixel_of(torch.tensor([10.0, 0.0, 0.0]))
+        >>> row.item(), column.item()
+        (6, 512)
     """
 
     sensor: LidarSensor

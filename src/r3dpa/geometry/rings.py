@@ -47,6 +47,12 @@ class RingProjection:
         legacy_rows: Count rings from the bottom row, each from where the quadrant falls from the
             last to the first, as R2DM and R2Flow do; see :func:`unfolded_rows`.
         legacy_hiding: See :class:`r3dpa.geometry.SphericalProjection`.
+
+    Example:
+        >>> projection = RingProjection(LidarSensor(beams=2), (1.0, -1.0))
+        >>> inclination, azimuth = projection.ray_angles()
+        >>> inclination.rad2deg().tolist(), len(azimuth)
+        ([1.0, -1.0], 1024)
     """
 
     sensor: LidarSensor

@@ -63,6 +63,13 @@ class ReconstructionQuality(Metric):
     ``return_iou`` and ``missing_iou``, intersection over union of the pixels with and without one;
     ``flying``, the share of returns that are :func:`flying_pixels`, and ``flying_scans``, the same
     share of the scans themselves.
+
+    Example:
+        >>> metric = ReconstructionQuality()
+        >>> scan = torch.full((1, 4, 8), 10.0)
+        >>> metric.update(scan, scan + 0.5)
+        >>> metric.compute()["range_error_m"]
+        0.5
     """
 
     full_state_update = False

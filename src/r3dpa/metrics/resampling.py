@@ -24,6 +24,11 @@ class Resampling:
         seed: Seed of each metric that draws subsets.
         num_resamples: Number of groups of samples; each resample leaves out one. 0 for no
             intervals.
+
+    Example:
+        >>> low, high = Resampling().of_share(torch.tensor([1, 1, 1, 0]))
+        >>> f"{low:.3f} to {high:.3f}"
+        '0.301 to 0.954'
     """
 
     seed: int = 0

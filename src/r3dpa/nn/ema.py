@@ -25,6 +25,20 @@ class EMA(nn.Module):
         latent_norm: Its statistics.
         decay: Weight of the old average, in [0, 1).
         buffers: ``copy`` or ``decay``.
+
+    Example:
+        >>> from r3dpa.nn import SiT
+        >>> small = {"hidden_size": 32, "depth": 2, "num_heads": 2, "alignment_depth": 1}
+        >>> sit = SiT((4, 8), in_channels=2, **small)
+        >>> norm = LatentNorm(channels=2)
+        >>> ema = EMA(sit, norm, decay=0.5)
+        >>> with torch.no_grad():
+        ...     for weight in sit.parameters():
+        ...         _ = weight.add_(1.0)
+        >>> before = next(ema.sit.parameters()).clone()
+        >>> ema.update(sit, norm)
+        >>> (next(ema.sit.parameters()) - before).mean().round(decimals=3).item()
+        0.5
     """
 
     def __init__(

@@ -94,6 +94,12 @@ class SiT(VelocityNetwork):
         periodic_columns: Let the position embedding wrap around with the scan.
         projector: ``mlp`` of three layers, or one ``conv`` over the grid of tokens (iREPA, Singh
             et al. 2025), which takes neither ``projector_dim`` nor official weights.
+
+    Example:
+        >>> small = {"hidden_size": 32, "depth": 2, "num_heads": 2, "alignment_depth": 1}
+        >>> sit = SiT((4, 8), in_channels=2, **small)
+        >>> tuple(sit.velocity(torch.randn(3, 2, 4, 8), torch.tensor([0.0, 0.5, 1.0])).shape)
+        (3, 2, 4, 8)
     """
 
     pos_embed: Tensor

@@ -60,6 +60,11 @@ class Posterior:
         mean: ``(B, C, h, w)``.
         logvar: ``(B, C, h, w)`` natural logarithm of the variance, in [-30, 20].
         std: ``(B, C, h, w)`` standard deviation.
+
+    Example:
+        >>> posterior = Posterior(torch.zeros(1, 16, 4, 8))  # means 0, variances 1
+        >>> posterior.kl().item(), tuple(posterior.sample(torch.randn(1, 8, 4, 8)).shape)
+        (0.0, (1, 8, 4, 8))
     """
 
     def __init__(self, moments: Tensor) -> None:
@@ -183,6 +188,12 @@ class VAE(Autoencoder):
         intensity: Images have a channel of intensity after range and return.
         num_classes: Classes of the returns, whose number is the last channel of the images; 0 where
             they have none.
+
+    Example:
+        >>> vae = VAE(channels=32, num_res_blocks=1)
+        >>> posterior = vae.encode(torch.zeros(2, 1, 16, 64))
+        >>> tuple(posterior.mean.shape), tuple(vae.decode(posterior.mean).shape)
+        ((2, 8, 4, 8), (2, 1, 16, 64))
     """
 
     def __init__(

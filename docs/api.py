@@ -1,0 +1,26 @@
+"""Write API pages of both packages into a folder: ``python docs/api.py build/docs``."""
+
+import importlib
+import pkgutil
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pdoc
+import pdoc.render
+
+
+def module_names(package: str) -> Iterator[str]:
+    """Yield the names of a package and of all its modules."""
+    module = importlib.import_module(package)
+    for name in module.__all__:  # imported on first use, which pdoc does not trigger
+        setattr(module, name, getattr(module, name))
+    yield package
+    for found in pkgutil.walk_packages(module.__path__, f"{package}."):
+        if not found.name.endswith(".__main__"):
+            yield found.name
+
+
+pdoc.render.configure(docformat="google")
+names = [name for package in ("lidarsim", "r3dpa") for name in module_names(package)]
+pdoc.pdoc(*names, output_directory=Path(sys.argv[1]))
