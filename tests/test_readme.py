@@ -1,4 +1,4 @@
-"""The Python of the README runs in a folder with the files it names; paths in documents exist."""
+"""The Python of the README runs, its layout links to definitions, paths in documents exist."""
 
 from __future__ import annotations
 
@@ -15,6 +15,21 @@ from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProje
 
 TOP = Path(__file__).resolve().parents[1]
 README = TOP / "README.md"
+# What a reader of the paper looks for, and a definition in the file that the layout table links.
+ANSWERS = {
+    "spherical projection": "class SphericalProjection",
+    "log2 encoding": "class RangeCodec",
+    "pooling to 8 x 64": "def pool_cells",
+    "interpolant": "class Interpolant",
+    "Euler-Maruyama": "def euler_maruyama",
+    "alignment loss": "def alignment_loss",
+    "circular convolution": "class CircularConv2d",
+    "posterior and KL": "class Posterior",
+    "SiT block": "class SiTBlock",
+    "latent norm": "class LatentNorm",
+    "EMA": "class EMA",
+    "FWID": "FWID and FGEO are",
+}
 
 
 def test_python_of_the_readme_runs(tmp_path, monkeypatch):
@@ -33,6 +48,14 @@ def test_python_of_the_readme_runs(tmp_path, monkeypatch):
     assert names["scenes"].range_m.shape[0] == 4
     assert names["jsd"] == 0
     assert names["image_m"].shape == (64, 1024)
+
+
+@pytest.mark.parametrize(("question", "definition"), ANSWERS.items())
+def test_layout_table_links_to_the_definition(question, definition):
+    layout = README.read_text().partition("## Layout")[2]
+    link = re.search(rf"\[{question}\]\(([^)]+)\)", layout)
+    assert link, question
+    assert definition in (TOP / link[1]).read_text()
 
 
 @pytest.mark.parametrize(

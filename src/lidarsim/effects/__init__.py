@@ -2,6 +2,22 @@
 
 Each effect is a frozen dataclass with its equation in the docstring. It decides from the scene
 whether it runs, selects its rays, and changes nothing else.
+
+======================================================= ============================================
+effects                                                 called for by
+======================================================= ============================================
+``rolling_shutter``, ``moving_actors``                  a moving sensor, moving traffic
+``foliage_occlusion``, ``ego_occlusion``                leaves, grass, wire mesh; the recording car
+``diffuse_reflection``, ``surface_texture``             surfaces
+``wet_ground``                                          water on the road
+``retro_reflection``, ``blooming``                      signs and plates
+``glass``, ``polished_metal``                           panes and cabins; steel
+``mixed_pixels``                                        edges within a beam
+``fog``, ``rain``, ``snow``                             weather
+``spray``, ``sun_glare``                                a fast car on a wet road; a low sun
+``soft_raydrop``, ``detection_limit``, ``lost_shots``   the instrument
+``range_noise``, ``laser_calibration``, ``dual_return`` the instrument
+======================================================= ============================================
 """
 
 from lidarsim.effects.edges import MixedPixels
