@@ -95,6 +95,16 @@ class TestBlend:
             edge = self.blend(generated_m, range_m, missing)[1]
             torch.testing.assert_close(edge, torch.full((64,), expected))
 
+    @pytest.mark.parametrize(("ratio", "is_one_surface"), [(1.29, True), (1.31, False)])
+    def test_one_surface_ends_at_a_ratio_of_1_3(self, ratio, is_one_surface):
+        """Generated pixels at the nearer neighbour pull the mean of an edge to it."""
+        range_m, missing = torch.full((16, 64), 10.0), rows_missing(2)
+        range_m[2:] = 10 * ratio
+        interpolated = 2 / (1 / 10 + 1 / (10 * ratio))
+        expected = interpolated if is_one_surface else (interpolated + 10) / 2
+        edge = self.blend(10.0, range_m, missing)[1]
+        torch.testing.assert_close(edge, torch.full((64,), expected))
+
     def test_where_interpolation_has_nothing_it_is_as_generated(self):
         range_m, missing = torch.full((16, 64), -1.0), rows_missing(2)
         assert (self.blend(12.0, range_m, missing)[1] == 12).all()
