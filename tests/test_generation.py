@@ -92,6 +92,7 @@ def test_single_returns_of_a_scene_are_dropped_by_its_number_and_seed():
     assert not torch.equal(holes[0], holes[1])
     assert torch.equal(scenes.generate([1], seed=3).range_m < 0, found.range_m[1:] < 0)
     assert not torch.equal(scenes.generate([1], seed=4).range_m < 0, found.range_m[1:] < 0)
+    assert not torch.equal(scenes.decode(found.latents, [0, 1], seed=4) < 0, found.range_m < 0)
     alone = SceneGenerator(vae, sit, norm, geometry, ODE, batch_size=1)
     assert torch.equal(alone.decode(found.latents, [0, 1], seed=3) < 0, found.range_m < 0)
 
