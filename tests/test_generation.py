@@ -222,15 +222,17 @@ def test_autoguidance_is_the_written_out_formula():
 GUIDANCE = PerturbedAttention(block=1, scale=1.5)
 
 
-def test_scenes_are_guided_away_from_the_network_without_one_attention_map():
+@pytest.mark.parametrize("block", [1, 2])
+def test_scenes_are_guided_away_from_the_network_without_one_attention_map(block):
     sampler, networks = SamplerConfig("ab2", 6), tiny_networks()
     sit = networks[1]
-    found = SceneGenerator(*networks, GEOMETRY, sampler, guidance=GUIDANCE).generate([0, 1])
+    guidance = PerturbedAttention(block, 1.5)
+    found = SceneGenerator(*networks, GEOMETRY, sampler, guidance=guidance).generate([0, 1])
     assert found.nfe == 12
     start = torch.stack([torch.randn(LATENT_SHAPE, generator=scene_random(0, i)) for i in (0, 1)])
 
     def guided(x, time):
-        strong, weak = velocity_and_perturbed(sit, x, sit.modulations(time[:1]), 1)
+        strong, weak = velocity_and_perturbed(sit, x, sit.modulations(time[:1]), block)
         return 1.5 * strong - 0.5 * weak
 
     with torch.no_grad():

@@ -78,6 +78,7 @@ class TestInterpolation:
     def test_a_sector_is_filled_from_pixels_that_were_filled_between_beams(self):
         range_m = torch.full((16, 64), 10.0)
         range_m[2::4] = 20.0
+        range_m[:, 32:] = 40.0
         missing = rows_missing(2)
         missing[:, 5] = True
         made = interpolate_gaps(range_m, missing, "linear")
