@@ -43,7 +43,7 @@ from r3dpa.geometry import (
     points_of,
     range_image,
 )
-from r3dpa.nn import VAE
+from r3dpa.nn import VAE, ThinDecoder
 from r3dpa.nn.perturbed_attention import velocity_and_perturbed
 
 SENSOR = LidarSensor(beams=16, columns=64, range_min_m=2.0, range_max_m=40.0)
@@ -92,6 +92,7 @@ def test_single_returns_of_a_scene_are_dropped_by_its_number_and_seed():
     assert not torch.equal(holes[0], holes[1])
     assert torch.equal(scenes.generate([1], seed=3).range_m < 0, found.range_m[1:] < 0)
     assert not torch.equal(scenes.generate([1], seed=4).range_m < 0, found.range_m[1:] < 0)
+    assert not torch.equal(scenes.decode(found.latents, [0, 1], seed=4) < 0, found.range_m < 0)
     alone = SceneGenerator(vae, sit, norm, geometry, ODE, batch_size=1)
     assert torch.equal(alone.decode(found.latents, [0, 1], seed=3) < 0, found.range_m < 0)
 
@@ -213,25 +214,36 @@ def test_autoguidance_is_the_written_out_formula():
     half_way = Autoguidance(weak, 2.0, (0.0, 0.5))
     scenes = SceneGenerator(*tiny_networks(), GEOMETRY, sampler, autoguidance=half_way)
     assert scenes.generate([0]).nfe == 6 + 3  # of the times 1, 5/6, ..., 1/6
+    early = Autoguidance(weak, 2.0, (0.5, 1.0))  # both ends count
+    scenes = SceneGenerator(*tiny_networks(), GEOMETRY, sampler, autoguidance=early)
+    assert scenes.generate([0]).nfe == 6 + 4
 
 
 GUIDANCE = PerturbedAttention(block=1, scale=1.5)
 
 
-def test_scenes_are_guided_away_from_the_network_without_one_attention_map():
+@pytest.mark.parametrize("block", [1, 2])
+def test_scenes_are_guided_away_from_the_network_without_one_attention_map(block):
     sampler, networks = SamplerConfig("ab2", 6), tiny_networks()
     sit = networks[1]
-    found = SceneGenerator(*networks, GEOMETRY, sampler, guidance=GUIDANCE).generate([0, 1])
+    guidance = PerturbedAttention(block, 1.5)
+    found = SceneGenerator(*networks, GEOMETRY, sampler, guidance=guidance).generate([0, 1])
     assert found.nfe == 12
     start = torch.stack([torch.randn(LATENT_SHAPE, generator=scene_random(0, i)) for i in (0, 1)])
 
     def guided(x, time):
-        strong, weak = velocity_and_perturbed(sit, x, sit.modulations(time[:1]), 1)
+        strong, weak = velocity_and_perturbed(sit, x, sit.modulations(time[:1]), block)
         return 1.5 * strong - 0.5 * weak
 
     with torch.no_grad():
         expected = ode_solver("ab2")(guided, start, ode_times(6))
     torch.testing.assert_close(found.latents, expected, atol=1e-5, rtol=0)
+
+
+def test_guidance_of_strength_one_costs_nothing():
+    none = PerturbedAttention(1, 1.0)
+    scenes = SceneGenerator(*tiny_networks(), GEOMETRY, SamplerConfig("ab2", 6), guidance=none)
+    assert (scenes.generate([0]).nfe, scenes.guidance_scale) == (6, 1)
 
 
 def test_the_recorded_guidance_is_the_default(tmp_path):
@@ -276,9 +288,11 @@ def test_average_velocities_are_not_guided(few_step):
 
 
 @pytest.mark.parametrize("scale", [0.5, float("nan"), float("inf")])
-def test_a_scale_of_guidance_below_one_is_refused(scale):
+def test_a_scale_of_guidance_below_one_is_refused(scale, few_step):
     with pytest.raises(ValueError, match="scale of guidance must be a number of 1 or more"):
         PerturbedAttention(1, scale)
+    with pytest.raises(ValueError, match="scale of guidance must be a number of 1 or more"):
+        SceneGenerator.from_checkpoint(few_step, ODE, guidance_scale=scale)
 
 
 @pytest.mark.slow
@@ -313,6 +327,12 @@ def test_options_that_do_not_fit_are_refused():
 def test_a_request_for_no_scene_is_refused(none):
     with pytest.raises(ValueError, match="no scene is requested"):
         generator().generate(none)
+
+
+@pytest.mark.parametrize("wrong", [True, "3", 1.5])
+def test_what_is_no_number_of_scenes_is_refused(wrong):
+    with pytest.raises(ValueError, match="give a number of scenes or their indices, got"):
+        generator().generate(wrong)
 
 
 def test_a_number_of_scenes_may_be_one_of_numpy():
@@ -503,6 +523,21 @@ class TestFewSteps:
         ranges = GEOMETRY.codec.ranges_of(image, SENSOR)
         torch.testing.assert_close(scenes.range_m, ranges, atol=1e-3, rtol=0)
         assert few_step.network("ema").arguments["average_blocks"] == 1
+
+    def test_the_thin_decoder_is_the_default_of_the_quality_instant_alone(self, few_step):
+        def decoder(sampler, **options):
+            made = SceneGenerator.from_checkpoint(few_step, sampler, device="cpu", **options)
+            return type(made.vae)
+
+        assert decoder("instant") is decoder("draft", decoder="thin") is ThinDecoder
+        assert decoder("draft") is decoder("instant", decoder="full") is VAE
+
+    def test_no_guidance_may_be_asked_for(self, few_step):
+        plain, one = (
+            SceneGenerator.from_checkpoint(few_step, "instant", device="cpu", guidance_scale=scale)
+            for scale in (None, 1.0)
+        )
+        assert torch.equal(plain.generate([0]).latents, one.generate([0]).latents)
 
     def test_other_qualities_do_not_see_the_copied_blocks(self, few_step):
         made = SceneGenerator.from_checkpoint(few_step, ODE, device="cpu")

@@ -8,7 +8,13 @@ import pytest
 import torch
 
 from r3dpa.baselines.diffusion import loss_weight, weighted_mean
-from r3dpa.baselines.diffusion_paths import DiffusionPath, repaint
+from r3dpa.baselines.diffusion_paths import (
+    DiffusionPath,
+    StepPath,
+    forward_step,
+    inpaint,
+    repaint,
+)
 from r3dpa.flow.interpolant import Interpolant
 from r3dpa.flow.sampler import SamplerConfig
 from r3dpa.flow.sde import ancestral, ancestral_step
@@ -98,9 +104,109 @@ def test_eta_is_checked_and_counts_draws():
         ancestral(lambda x, t: x, x, ode_times(2), [x])
 
 
-def test_repaint_refuses_no_steps():
-    with pytest.raises(ValueError, match="at least 1, got 4, 0 and 1"):
-        repaint(lambda x, t: x, torch.zeros(1), torch.zeros(1), iter(()), DiffusionPath(), 4, 0)
+@pytest.mark.parametrize("counts", [(0, 1, 1), (4, 0, 1), (4, 1, 0)])
+def test_repaint_refuses_no_steps(counts):
+    steps, resamplings, jump = counts
+    with pytest.raises(ValueError, match=f"at least 1, got {steps}, {resamplings} and {jump}"):
+        repaint(
+            *(lambda x, t: x, torch.zeros(1), torch.zeros(1), iter(()), DiffusionPath()), *counts
+        )
+
+
+def counted_draws(shape, taken):
+    while True:
+        taken.append(torch.randn(shape, dtype=torch.float64))
+        yield taken[-1]
+
+
+@pytest.mark.parametrize(
+    ("steps", "resamplings", "jump", "num"), [(2, 2, 1, 8), (1, 3, 2, 5), (3, 1, 1, 7)]
+)
+def test_draws_of_repaint(steps, resamplings, jump, num):
+    """The state; two for each small step; one for each step back, but none in the last interval."""
+    taken, known = [], torch.zeros(1, 1, dtype=torch.float64)
+    draws = counted_draws((1, 1), taken)
+    repaint(lambda x, t: x, known, known, draws, DiffusionPath(), steps, resamplings, jump)
+    assert (
+        len(taken)
+        == num
+        == 1 + 2 * jump * (resamplings * (steps - 1) + 1) + jump * (resamplings - 1) * (steps - 1)
+    )
+
+
+@pytest.mark.parametrize("path", PATHS, ids=lambda path: f"{path.schedule}{path.shift:.1f}")
+def test_a_step_forward_gives_the_signal_and_noise_of_the_later_time(path):
+    here, there = torch.tensor([0.2, 0.5]).double(), torch.tensor([0.6, 0.9]).double()
+    alpha_s, sigma_s, *_ = path.coefficients(here)
+    alpha_t, sigma_t, *_ = path.coefficients(there)
+    zero, one = torch.zeros(2, 1).double(), torch.ones(2, 1).double()
+    of_data = forward_step(alpha_s[:, None] * one, here, there, zero, path)
+    torch.testing.assert_close(of_data[:, 0], alpha_t)
+    of_noise = forward_step(sigma_s[:, None] * one, here, there, zero, path)
+    of_draw = forward_step(zero, here, there, one, path)
+    torch.testing.assert_close((of_noise.square() + of_draw.square())[:, 0], sigma_t.square())
+
+
+def test_known_parts_have_the_noise_of_the_time_that_the_network_is_asked_about():
+    """One draw for each step, and no other noise."""
+    path, taken, seen = DiffusionPath(), [], []
+    known = torch.full((1, 2), 0.7, dtype=torch.float64)
+    mask = torch.tensor([1.0, 0.0]).double()
+
+    def velocity(x, time):
+        seen.append((x[0, 0], time))
+        return 0 * x
+
+    draws = counted_draws((1, 2), taken)
+    inpaint(velocity, torch.randn(1, 2).double(), known, mask, ode_times(3), draws, path)
+    assert len(taken) == len(seen) == 3
+    for (value, time), draw in zip(seen, taken, strict=True):
+        torch.testing.assert_close(value, path.interpolate(known, draw, time.double())[0, 0])
+
+
+@pytest.mark.parametrize("schedule", ["cosine", "linear"])
+def test_the_shift_is_added_to_the_log_snr(schedule):
+    time = torch.linspace(0.1, 0.9, 5).double()
+    shifted = DiffusionPath(schedule=schedule, shift=-1.5).log_snr(time)
+    torch.testing.assert_close(shifted, DiffusionPath(schedule=schedule).log_snr(time) - 1.5)
+
+
+@pytest.mark.parametrize("path", PATHS, ids=lambda path: f"{path.schedule}{path.shift:.1f}")
+def test_the_score_points_against_the_noise(path):
+    data, noise = torch.randn(2, 4, 3, dtype=torch.float64, generator=torch.manual_seed(0))
+    time = torch.linspace(0.2, 0.9, 4, dtype=torch.float64)
+    noisy = path.interpolate(data, noise, time)
+    sigma = path.coefficients(time)[1][:, None]
+    score = path.score(path.velocity(data, noisy, time), noisy, time)
+    torch.testing.assert_close(score, -noise / sigma)
+
+
+class TestDiscreteSteps:
+    path = StepPath()
+
+    def test_roots_of_the_variances_rise_linearly(self):
+        betas = self.path.betas
+        assert (betas[0].item(), betas[-1].item()) == pytest.approx((0.0015, 0.0195))
+        assert betas[499:501].sqrt().mean().item() == pytest.approx((0.0015**0.5 + 0.0195**0.5) / 2)
+
+    def test_times_of_whole_steps_have_the_signal_of_these(self):
+        """Times in float32, whose product with the number of steps is not whole."""
+        steps = torch.arange(1000)
+        time = steps / 1000
+        assert torch.equal(self.path.step_of(time), steps.float())
+        expected = self.path.signal.logit().float()
+        torch.testing.assert_close(self.path.log_snr(time), expected)
+
+    def test_between_two_steps_the_log_snr_is_straight(self):
+        time = torch.tensor([0.0005, 0.5004, 0.9985]).double().requires_grad_()
+        (slope,) = torch.autograd.grad(self.path.log_snr(time).sum(), time)
+        alpha, sigma, d_alpha, d_sigma = self.path.coefficients(time)
+        of_alpha, of_sigma = (
+            torch.autograd.grad(value.sum(), time, retain_graph=True)[0] for value in (alpha, sigma)
+        )
+        assert (slope < 0).all()
+        torch.testing.assert_close(d_alpha, of_alpha)
+        torch.testing.assert_close(d_sigma, of_sigma)
 
 
 def test_weights_bound_the_signal_to_noise_ratio():

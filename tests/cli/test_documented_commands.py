@@ -24,6 +24,7 @@ TOP = Path(__file__).resolve().parents[2]
 CONF = TOP / "conf"
 PYPROJECT = TOP / "pyproject.toml"
 EXTRAS = tomllib.loads(PYPROJECT.read_text())["project"]["optional-dependencies"]
+MAKEFILE = (TOP / "Makefile").read_text()
 # Given to `test` and `predict` in place of the configuration of a run that is not there.
 JOINT = [CONF / f"{name}.yaml" for name in ("trainer", "data/simulated", "experiment/joint")]
 
@@ -55,16 +56,34 @@ def spans_of(text, command):
     return re.findall(rf"`({command} [^`]+)`", prose.replace("\n", " "))
 
 
+# Targets whose recipes call `r3dpa`, in each of their variants.
+MAKE = (
+    *("demo", "demo DATA=scans", "demo SCRATCH=1", "demo SCRATCH=1 DATA=scans"),
+    *("gallery", "r3dpa-s", "bench-training", "bench-sampling", "bench-gpu CKPT=a.ckpt"),
+    "ablations",
+)
+
+
+def recipe_of(words, makefile="Makefile"):
+    """What ``make`` would run after its set-up; a variable that nothing defines is an error."""
+    make = ["make", "--dry-run", "--warn-undefined-variables", "-o", ".venv/.installed"]
+    result = subprocess.run(
+        [*make, "-f", makefile, *words.split()], cwd=TOP, capture_output=True, text=True
+    )
+    assert not result.stderr, f"make {words}: {result.stderr}"
+    assert result.returncode == 0
+    lines = result.stdout.replace("\\\n", " ").splitlines()
+    return "\n".join(re.sub(r"^.*?\.venv/bin/r3dpa ", "r3dpa ", line) for line in lines)
+
+
 def documented():
     found = {}
     for name, text in documents().items():
         # A span without options only names a command.
         complete = [s for s in spans_of(text, "r3dpa") if " --" in s and "--help" not in s]
         found[name] = "\n".join([text, *complete])
-    fit = "r3dpa fit --config conf/data/demo.yaml"
-    make = re.sub(r"\$\((BOX_)?FIT\)", fit, (TOP / "Makefile").read_text())
-    make = re.sub(r"\$\(BIN\)/|OMP_NUM_THREADS=1|\$\(if.*", "", make)
-    found["Makefile"] = re.sub(r"\$\((\w+)\)", r"\1", make)
+    for words in MAKE:
+        found[f"make {words}"] = recipe_of(words)
     for path in sorted(CONF.rglob("*.yaml")):
         lines = [line for line in path.open() if re.match(r"#\s{2,}(r3dpa|--)", line)]
         found[str(path.relative_to(TOP))] = "".join(line.lstrip("# ") for line in lines)
@@ -126,6 +145,26 @@ def test_a_span_without_options_names_a_command():
             words = span.split()[1:]
             if words[0] not in {"COMMAND", "--help"} and words not in [[group] for group in groups]:
                 _find(words)
+
+
+def test_recipes_are_read_whole():
+    """As many commands as lines of a recipe that call ``r3dpa``, in all targets that do."""
+    for words in MAKE:
+        recipe = recipe_of(words)
+        assert len(list(commands_in(recipe))) == recipe.count("r3dpa ") > 0, words
+    called, target = set(), ""
+    for line in MAKEFILE.splitlines():
+        target = line.partition(":")[0] if re.match(r"[\w-]+:", line) else target
+        if line.startswith("\t") and re.search(r"/r3dpa |FIT\)", line):
+            called.add(target)
+    assert called == {words.split()[0] for words in MAKE}
+
+
+def test_a_missing_variable_of_the_makefile_fails(tmp_path):
+    renamed = tmp_path / "Makefile"
+    renamed.write_text(MAKEFILE.replace("R3DPA_S_FIT :=", "FIT_OF_R3DPA_S :="))
+    with pytest.raises(AssertionError, match="undefined variable 'R3DPA_S_FIT'"):
+        recipe_of("r3dpa-s", renamed)
 
 
 def test_readme_shows_every_group():

@@ -121,6 +121,24 @@ def test_presets_are_the_shipped_configurations(capsys, tmp_path, monkeypatch):
         main(["fit", "joint", "--preset", "kitti"])
 
 
+def test_the_paper_is_kitti360_with_scalr_and_a_global_batch_of_32_on_4_gpus():
+    """Features as in the ablations at the scale of the paper; all else as in the default preset."""
+
+    def data_of(name):
+        return yaml.safe_load((conf_folder() / f"{name}.yaml").read_text())["data"]
+
+    usual, paper = data_of("data/kitti360"), data_of("data/kitti360_paper")
+    ablation = yaml.safe_load((conf_folder() / "ablation/scale/paper.yaml").read_text())
+    extractor = ablation["config"]["data"]["init_args"]["extractor"]
+    assert paper["init_args"]["extractor"] == extractor
+    assert (
+        4 * paper["init_args"]["batch_size"]
+        == ablation["config"]["data"]["init_args"]["batch_size"]
+    )
+    usual["init_args"]["extractor"] = extractor
+    assert paper == usual
+
+
 def test_shipped_files_are_found_from_everywhere(capsys, tmp_path, monkeypatch):
     """As after an installation of the package; a file of the user with that name goes first."""
     monkeypatch.chdir(tmp_path)

@@ -75,6 +75,15 @@ class TestInterpolation:
         made = interpolate_gaps(range_m, missing, "linear")
         assert made[0, [62, 63, 0, 1]].tolist() == [18.0, 16.0, 14.0, 12.0]
 
+    def test_a_sector_is_filled_from_pixels_that_were_filled_between_beams(self):
+        range_m = torch.full((16, 64), 10.0)
+        range_m[2::4] = 20.0
+        range_m[:, 32:] = 40.0
+        missing = rows_missing(2)
+        missing[:, 5] = True
+        made = interpolate_gaps(range_m, missing, "linear")
+        assert made[:4, 5].tolist() == [10.0, 15.0, 20.0, 15.0]
+
 
 class TestBlend:
     def blend(self, generated_m, range_m, missing):
@@ -95,6 +104,16 @@ class TestBlend:
             edge = self.blend(generated_m, range_m, missing)[1]
             torch.testing.assert_close(edge, torch.full((64,), expected))
 
+    @pytest.mark.parametrize(("ratio", "is_one_surface"), [(1.29, True), (1.31, False)])
+    def test_one_surface_ends_at_a_ratio_of_1_3(self, ratio, is_one_surface):
+        """Generated pixels at the nearer neighbour pull the mean of an edge to it."""
+        range_m, missing = torch.full((16, 64), 10.0), rows_missing(2)
+        range_m[2:] = 10 * ratio
+        interpolated = 2 / (1 / 10 + 1 / (10 * ratio))
+        expected = interpolated if is_one_surface else (interpolated + 10) / 2
+        edge = self.blend(10.0, range_m, missing)[1]
+        torch.testing.assert_close(edge, torch.full((64,), expected))
+
     def test_where_interpolation_has_nothing_it_is_as_generated(self):
         range_m, missing = torch.full((16, 64), -1.0), rows_missing(2)
         assert (self.blend(12.0, range_m, missing)[1] == 12).all()
@@ -106,6 +125,21 @@ def test_themedian_draw_has_a_return_where_half_of_them_have():
     median = median_draw(Pixels(range_m, None, classes))
     assert median.range_m.tolist() == [[3.0, 2.0, -1.0]]
     assert median.classes[0, :2].tolist() == [6, 1]
+
+
+def test_two_of_four_draws_make_a_return():
+    range_m = torch.tensor([3.0, -1.0, 5.0, -1.0]).view(4, 1, 1)
+    assert median_draw(Pixels(range_m, None, None)).range_m.item() == 3
+    assert median_draw(Pixels(-range_m.abs(), None, None)).range_m.item() == -1
+
+
+def test_narrow_gaps_reach_over_eight_rows_from_return_to_return():
+    range_m = torch.full((16, 64), 10.0)
+    range_m[4:11, 0] = -1  # rows 3 and 11 are 8 apart
+    range_m[4:12, 1] = -1
+    unseen = unseen_pixels(range_m)
+    assert unseen[4:11, 0].all()
+    assert not unseen[:, 1].any()
 
 
 def test_unseen_are_empty_rows_and_narrow_gaps_between_returns():
@@ -151,6 +185,31 @@ class TestView:
     def test_others_are_refused_with_the_numbers(self, points, message):
         with pytest.raises(ValueError, match=message):
             self.check(points)
+
+    def test_limits_of_each_refusal(self):
+        """Just beyond each of them; the table of refusals above has cases far beyond."""
+        outside = torch.cat([cloud(10, 20, beams=16), cloud(-24, 2.0, beams=48)])  # 25 %
+        with pytest.raises(ValueError, match="25% of the points lie outside"):
+            self.check(outside)
+        with pytest.raises(ValueError, match="fills 72% of the 64 columns"):
+            self.check(cloud(-24.5, 2.5, azimuths_deg=(-125, 125)))
+        points = cloud(-24.5, 2.5)
+        range_m = range_image(points, PROJECTION)[0]
+        range_m[1::2, :40] = -1  # 47 % of the returns have nothing right below them
+        with pytest.raises(ValueError, match=r"only 5\d% of the returns"):
+            check_view(points, range_m, PROJECTION)
+
+    def test_more_than_three_fifths_outside_are_refused_of_another_sensor_too(self):
+        points = torch.cat([cloud(10, 20, beams=45), cloud(-24, 2.0, beams=15)])
+        with pytest.raises(ValueError, match="75% of the points lie outside"):
+            self.check(points, torch.zeros(16, 64, dtype=torch.bool))
+
+    def test_few_neighbours_below_say_nothing_of_the_number_of_beams(self):
+        """Of every second row and one more that is empty."""
+        points, missing = cloud(-24.5, 2.5), rows_missing(2)
+        range_m = range_image(points, PROJECTION)[0]
+        missing[1], range_m[1] = False, -1.0
+        check_view(points, range_m, PROJECTION, missing)
 
     def test_a_scan_of_fewer_beams_passes_where_the_others_are_missing(self):
         """A third of its points lies beyond the field of view of the checkpoint."""

@@ -21,7 +21,7 @@ from lidarsim.recorded import Instrument, RecordedScan, RecordedSweep, scale_of
 from lidarsim.scan import SECOND_RETURN_M, effect_name
 from lidarsim.scene import Conditions, Scene
 from lidarsim.sensors.spinning import hdl64e
-from lidarsim.weather import ADDED_CLASS, REFUSED, Weather, WeatherPrior
+from lidarsim.weather import ADDED_CLASS, REFUSED, Weather
 
 CALLED = {
     "fog": {"visibility_m": 60.0},
@@ -427,34 +427,6 @@ def test_a_loader_applies_weather_in_its_processes(scan):
     first, again = (list(loader) for loader in loaders)
     assert all(torch.equal(one, other) for one, other in zip(first, again, strict=True))
     assert first[0].numpy().tobytes() != first[1].numpy().tobytes()
-
-
-@pytest.fixture(scope="module")
-def drawn():
-    """Weather of training scans."""
-    return [WeatherPrior(1.0).draw(np.random.default_rng(seed)) for seed in range(3000)]
-
-
-class TestPrior:
-    """Rates are log-uniform, films have all depths."""
-
-    @pytest.mark.parametrize("name", ["visibility_m", "rain_mm_h", "snow_mm_h"])
-    def test_as_many_are_below_the_geometric_mean_as_above(self, drawn, name):
-        values = np.array([getattr(weather, name) for weather in drawn])
-        values = values[np.isfinite(values) & (values > 0)]
-        low, high = getattr(WeatherPrior(), name)
-        assert abs(len(values) - 1000) < 5 * math.sqrt(3000 * 2 / 9)
-        assert low <= values.min() < 1.1 * low
-        assert high / 1.1 < values.max() <= high
-        below = (values < math.sqrt(low * high)).mean()
-        assert abs(below - 0.5) < 5 * 0.5 / math.sqrt(len(values))
-
-    def test_films_in_rain_have_all_depths(self, drawn):
-        films = np.array([weather.water_film_mm for weather in drawn if weather.rain_mm_h])
-        assert all(weather.water_film_mm == 0 for weather in drawn if not weather.rain_mm_h)
-        assert 0 < films.min() < 0.05
-        assert 1.45 < films.max() < 1.5
-        assert abs(films.mean() - 0.75) < 5 * 1.5 / math.sqrt(12 * len(films))
 
 
 def test_recorded_powers_could_be_detected():

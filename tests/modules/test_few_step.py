@@ -1,5 +1,5 @@
 from collections import Counter
-from itertools import pairwise
+from itertools import combinations, pairwise
 from types import SimpleNamespace
 
 import pytest
@@ -8,7 +8,8 @@ from tiny_networks import SIT_ARGS, tiny_checkpoint
 from tiny_stages import ARGUMENTS, QUIET, Observed, TinyData, stage_module, tiny_sit, train
 
 from r3dpa.checkpoints import load_into, read_checkpoint
-from r3dpa.flow import average_times
+from r3dpa.flow import average_times, ode_times
+from r3dpa.flow.average_velocity import TIME_SHIFT
 from r3dpa.modules import FewStep, few_step
 from r3dpa.modules.stage import PathDraws
 from r3dpa.nn import VAE, AverageVelocitySiT, SiT, ThinDecoder
@@ -56,6 +57,63 @@ def test_steps_of_1_2_4_and_8_are_learned_equally_often():
     assert asked == expected
 
 
+def test_points_of_a_trajectory_lie_at_the_times_of_eight_average_steps():
+    """At a constant velocity c a point at time t is ``noise - (1 - t) c``."""
+    module = stage_module("few_step")
+    slope = torch.randn(4, 4, 8)
+    module.sit.velocity = lambda x, time: slope.expand_as(x)
+    points = module.solve([3])
+    time = average_times(8).to(points)[:, None, None, None]
+    torch.testing.assert_close(points[0], points[0, 0] - (1 - time) * slope)
+
+
+def test_the_noise_of_a_trajectory_depends_on_its_number_and_the_seed():
+    first, other = (stage_module("few_step", seed=seed) for seed in (0, 1))
+    noise = [module.solve([index])[0, 0] for module in (first, other) for index in (0, 1)]
+    for one, two in combinations(noise, 2):
+        assert not torch.allclose(one, two)
+    assert torch.equal(first.solve([0, 1])[1, 0], noise[1])
+
+
+def test_pairs_of_points_are_drawn_evenly_whatever_the_flow_was_trained_with():
+    assert stage_module("few_step", time_sampling="lognormal").time_sampling == "uniform"
+
+
+def test_a_flow_of_another_path_is_refused(tmp_path):
+    before = read_checkpoint(
+        tiny_checkpoint(tmp_path / "few.safetensors", TinyData.geometry, stage="few_step")
+    )
+    module = stage_module("few_step", path="cosine")
+    with pytest.raises(ValueError, match=r"was trained on the linear path.*model.init_args.path"):
+        module.previous_networks(before)
+
+
+def test_no_trajectories_are_refused():
+    with pytest.raises(ValueError, match="trajectories must be at least 1, got 0"):
+        stage_module("few_step", trajectories=0)
+
+
+@torch.no_grad()
+def test_held_out_errors_by_hand(monkeypatch):
+    """Ends of AB3 and of one step, 3 apart; a thin decoder that loses a quarter of the returns."""
+    module, times = stage_module("few_step"), []
+    module.geometry = TinyData.geometry
+    monkeypatch.setattr(few_step, "ab3", lambda _, x, grid: times.append(grid) or 0 * x)
+    monkeypatch.setattr(few_step, "average_velocity_steps", lambda _, x, grid: 0 * x + 3)
+    codec = TinyData.geometry.codec
+    range_m = torch.full((2, 8, 16), 10.0)
+    reconstruction = codec.encode(range_m)[:, None]
+    range_m[:, :2] = -1
+    module.thin_decoder.decode = lambda _: codec.encode(range_m)[:, None]
+    latents = torch.randn(2, 4, 4, 8)
+    errors = module.held_out_errors(reconstruction, latents, PathDraws(latents, None, latents))
+    assert errors["endpoint_1"].tolist() == errors["endpoint_4"].tolist() == [9, 9]
+    assert torch.equal(times[0], ode_times(16, shift=TIME_SHIFT))
+    count, either = errors["thin_return_iou"]
+    assert (count.tolist(), either.tolist()) == ([96, 96], [128, 128])
+    assert errors["thin_range_error_m"][0].tolist() == [0, 0]
+
+
 @pytest.mark.parametrize(
     ("name", "own", "theirs"), [("latent_channels", 8, 4), ("least_scale", 0.5, 0.25)]
 )
@@ -63,6 +121,14 @@ def test_a_thin_decoder_that_does_not_fit_the_vae_is_refused(name, own, theirs):
     vae = VAE(**ARGUMENTS["vae"] | {"least_scale": 0.25})
     thin = ThinDecoder(**ARGUMENTS["thin_decoder"] | {"least_scale": 0.25, name: own})
     with pytest.raises(ValueError, match=f"{name} is {own}, but {theirs} of the VAE"):
+        FewStep(vae, tiny_sit(average_blocks=1), thin)
+
+
+@pytest.mark.parametrize(("name", "own"), [("intensity", True), ("num_classes", 3)])
+def test_a_thin_decoder_of_other_channels_than_the_vae_has_is_refused(name, own):
+    vae = VAE(**ARGUMENTS["vae"] | {"in_channels": 2})
+    thin = ThinDecoder(**ARGUMENTS["thin_decoder"] | {"in_channels": 2, name: own})
+    with pytest.raises(ValueError, match=f"{name} is {own}, but .* of the VAE"):
         FewStep(vae, tiny_sit(average_blocks=1), thin)
 
 

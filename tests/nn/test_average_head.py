@@ -53,6 +53,29 @@ def test_training_moves_the_average_velocity_alone():
     assert not torch.allclose(one, other)
 
 
+def test_the_embedded_length_of_a_step_is_time_minus_target():
+    network, lengths = few_step(), []
+    network.average.embedder.register_forward_pre_hook(lambda _, given: lengths.append(given[0]))
+    network.average_modulations(torch.tensor([0.75]), torch.tensor([0.25]))
+    assert lengths[0].tolist() == [0.5]
+
+
+def test_the_average_velocity_comes_from_the_copied_output_layer():
+    network = few_step()
+    x, time = torch.randn(2, 4, 4, 16), torch.tensor([0.3, 0.9])
+    average = network.average_velocity(x, time, 0 * time)
+    nn.init.zeros_(network.final_layer.linear.weight)
+    assert torch.equal(network.average_velocity(x, time, 0 * time), average)
+    nn.init.zeros_(network.average.final_layer.linear.weight)
+    assert not torch.allclose(network.average_velocity(x, time, 0 * time), average)
+
+
+def test_blocks_and_their_copies_are_compiled():
+    network = few_step(average_blocks=2)
+    assert network.compiled_parts == [*network.blocks, *network.average.blocks]
+    assert len(network.compiled_parts) == 5
+
+
 def test_the_length_of_a_step_is_not_rounded_in_half_precision():
     """Blocks in bfloat16; the difference of two times is that of float32."""
     network = few_step().to_bfloat16_()

@@ -96,3 +96,12 @@ def training_pass(case, network, latents, path):
         "denoising_loss": flow_matching_loss(output.velocity, path.target(latents, noise, time)),
         "proj_loss": alignment_loss(output.features, case["in/zs"]),
     }
+
+
+def check(case, key, found, atol=1e-5):
+    torch.testing.assert_close(
+        torch.as_tensor(found).detach().double(),
+        case[key].double(),
+        **scaled(atol)(key, case[key]),
+        msg=lambda text: f"{key}: {text}",
+    )

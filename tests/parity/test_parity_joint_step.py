@@ -201,10 +201,31 @@ def test_joint_step_losses_and_gradients(recorded, values, close):
             close(value, recorded[key])
 
 
-def test_joint_step_weights_statistics_and_ema(recorded, values, close):
-    """Weights in units of the learning rate: AdamW amplifies the rounding of tiny gradients."""
+def has_reliable_step(run, name, steps):
+    """Where AdamW's step of a weight is decided by its gradient and not by the rounding of it.
+
+    AdamW divides by the size of the gradient. Sums of float32 terms are off by about 1e-6 of the
+    largest gradient of the tensor; a hundred times that fixes the step to one percent of it.
+    """
+    reliable = True
+    for step in run[:steps]:
+        gradient = step["gradients"][name].abs()
+        reliable = reliable & (gradient > 1e-4 * gradient.max())
+    return reliable
+
+
+def test_reliable_steps_leave_out_gradients_of_the_size_of_their_rounding():
+    run = [{"gradients": {"w": torch.tensor([1.0, -2e-4, 5e-5])}}]
+    run += [{"gradients": {"w": torch.tensor([-1.0, 5e-5, 1.0])}}]
+    assert has_reliable_step(run, "w", 1).tolist() == [True, True, False]
+    assert has_reliable_step(run, "w", 2).tolist() == [True, False, False]
+
+
+def test_joint_step_weights_statistics_and_ema(recorded, run, values, close):
+    """Weights in units of the learning rate, where the gradient exceeds its rounding error."""
     start, learning_rate = recorded.weights(), recorded.config["lr"]
     moved = dict.fromkeys(("vae", "sit", "ema", "discriminator"), 0.0)
+    num_weights = num_compared = 0
     for key, value in values.items():
         _, separator, official = key.partition("/weights/")
         if separator:
@@ -212,8 +233,16 @@ def test_joint_step_weights_statistics_and_ema(recorded, values, close):
             statistic = ".bn." in official or "running_" in official
             tolerance = {"atol": 5e-6, "rtol": 1e-5} if statistic else {"atol": 0.0, "rtol": 3e-7}
             tolerance["atol"] = max(tolerance["atol"], 0.01 * learning_rate)
-            close(value, recorded[key], **tolerance)
+            name, expected = ours(official).removeprefix("ema."), recorded[key]
             network = official.partition(".")[0]
+            if name in run[0]["gradients"]:
+                reliable = has_reliable_step(run, name, len(run))
+                num_weights += reliable.numel()
+                num_compared += int(reliable.sum())
+                close(value, expected, atol=2 * len(run) * learning_rate, rtol=3e-7)
+                value, expected = value[reliable], expected[reliable]
+            close(value, expected, **tolerance)
             change = (recorded[key].double() - start[official].double()).abs().max().item()
             moved[network] = max(moved[network], change)
+    assert num_compared > 0.95 * num_weights
     assert all(change > 1e-3 * learning_rate for change in moved.values())

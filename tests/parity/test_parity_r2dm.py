@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 import torch.nn.functional as F
-from recorded_networks import scaled, with_outputs
+from recorded_networks import check, scaled, with_outputs
 
 from r3dpa.baselines.base import AveragedNetwork
 from r3dpa.baselines.diffusion import (
@@ -31,15 +31,6 @@ from r3dpa.baselines.r2dm import R2DM, ema_decay_at
 from r3dpa.baselines.readers import unet_weights
 from r3dpa.checkpoints import read_checkpoint
 from r3dpa.flow.sde import ancestral, ancestral_step
-from r3dpa.geometry import (
-    LidarSensor,
-    RangeCodec,
-    RingProjection,
-    SphericalProjection,
-    in_range,
-    range_image,
-    unproject,
-)
 
 PREDICTIONS = ("eps", "v", "x_0")
 
@@ -166,15 +157,6 @@ def denoiser(network, path, kind="eps", clip=True):
 def velocity_of(network, path, kind="eps"):
     denoise = denoiser(network, path, kind)
     return lambda x, time: path.velocity(denoise(x, time), x, time)
-
-
-def check(case, key, found, atol=1e-5):
-    torch.testing.assert_close(
-        torch.as_tensor(found).detach().double(),
-        case[key].double(),
-        **scaled(atol)(key, case[key]),
-        msg=lambda text: f"{key}: {text}",
-    )
 
 
 @pytest.mark.parametrize("schedule", ["cosine", "linear", "cosine_shifted"])
@@ -392,89 +374,6 @@ def test_r2dm_diffusion_every_array_is_compared(diffusion, unet_case):
     assert not unnamed
     count = sum("scale" not in key for key in unet_case.keys("w/"))
     assert case["out/state_dict_key_count"] > count  # its constants are no weights here
-
-
-# Points and images
-
-
-@pytest.fixture(scope="module")
-def lidar(baseline_case):
-    case = baseline_case("r2dm_r2flow_lidar")
-    config = case.config
-    limits = config["min_depth"], config["max_depth"]
-    return case, LidarSensor(config["H"], config["W"], 3.0, -25.0, *limits)
-
-
-def test_r2dm_r2flow_lidar_projections(lidar):
-    case, sensor = lidar
-    points = case["in/points"]
-    distance = points[:, :3].norm(dim=1, keepdim=True)
-    inside = in_range(points[:, :3], sensor)[:, None].float()
-    values = torch.cat([points, distance, inside], dim=1)
-    rings = RingProjection(sensor, (0.0,) * sensor.beams, legacy_rows=True, legacy_hiding=True)
-    spherical = SphericalProjection(sensor, legacy_hiding=True)
-    for name, projection in (("spherical", spherical), ("unfolding", rings)):
-        range_m, image = range_image(points[:, :3], projection, values)
-        check(case, f"out/{name}_raw", image.permute(1, 2, 0))
-        check(case, f"out/{name}", image * image[5])
-        assert torch.equal(range_m > 0, image[5] == 1)
-
-
-def codecs(sensor):
-    """By names in R2DM and R2Flow."""
-    farthest = torch.tensor(sensor.range_max_m + 1.0).double().log2().item()
-    return {
-        ("log_depth", "logscale"): RangeCodec("log2", farthest, offset_m=0.0),
-        ("inverse_depth", "inverse"): RangeCodec("inverse", sensor.range_min_m),
-        ("depth", "metric"): RangeCodec("linear", sensor.range_max_m),
-    }
-
-
-def test_r2dm_r2flow_lidar_codecs(lidar):
-    """Values in [0, 1] of R2DM and in [-1, 1] of R2Flow, at all pixels and at the limits."""
-    case, sensor = lidar
-    scan = case["out/spherical"][None, 4:5]
-
-    def valid(metric):
-        inside = (metric > sensor.range_min_m) & (metric < sensor.range_max_m)
-        return torch.where(inside, metric, -1.0)
-
-    for (r2dm, r2flow), codec in codecs(sensor).items():
-        for edge, metric, images in (
-            ("", scan, None),
-            ("edge_", case["in/edge_metric"], 2 * case["in/edge_normalized"] - 1),
-        ):
-            encoded = codec.encode(valid(metric))
-            check(case, f"out/r2dm_{edge}convert_{r2dm}", (encoded + 1) / 2)
-            check(case, f"out/r2flow_{edge}convert_{r2flow}", encoded)
-            image = encoded if images is None else images
-            back = codec.decode(image, sensor).clamp(min=0)
-            check(case, f"out/r2dm_{edge}revert_{r2dm}", back)
-            check(case, f"out/r2flow_{edge}restore_{r2flow}", back)
-    check(case, "out/r2dm_mask", (valid(scan) > 0).float())
-
-
-def test_r2dm_r2flow_lidar_rays(lidar):
-    case, sensor = lidar
-    projection = SphericalProjection(sensor)
-    angles = torch.stack(torch.meshgrid(*projection.ray_angles(corner=True), indexing="ij"))
-    check(case, "out/r2dm_ray_angles", angles[None])
-    check(case, "out/r2dm_ray_angles", hdl64e_angles((sensor.beams, sensor.columns)))
-    fine = hdl64e_angles((64, 2048))
-    size = sensor.beams, sensor.columns
-    resized = F.interpolate(fine, size=size, mode="nearest-exact")
-    check(case, "out/ray_angles_resized_from_64x2048", resized)
-    full = hdl64e_angles((64, 1024))[0][:, [0, 1, 63]][..., [0, 1, 512, 1023]]
-    check(case, "out/hdl64e_angles_64x1024_rows0_1_63_cols0_1_512_1023", full)
-    scan = case["out/spherical"][4]
-    inside = (scan > sensor.range_min_m) & (scan < sensor.range_max_m)
-    xyz = unproject(torch.where(inside, scan, -1.0), projection, corner=True).permute(2, 0, 1)
-    check(case, "out/r2dm_to_xyz", xyz[None])
-    check(case, "out/r2flow_convert_cartesian", xyz[None])
-    check(case, "out/r2flow_restore_cartesian", xyz.norm(dim=0)[None, None] * inside)
-
-
-# Checkpoints, average
 
 
 def test_ema(baseline_case):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -87,8 +88,19 @@ def test_prepared_points(case, grid, scans, close):
     assert len(scan.kept) == case["out/n_after_crop0"]
     close(cloud[:, :3], prepared[:, :3])
     close(scan.features, prepared[scan.kept, 3:])
-    wide = replace(grid, minimum_m=(-256.0,) * 3, maximum_m=(256.0,) * 3)
-    assert len(prepare_scan(cloud.numpy(), wide).kept) == case["out/n_after_voxelize0"]
+    kept = prepare_scan(cloud.numpy(), widened(grid)).kept
+    assert len(kept) == case["out/n_after_voxelize0"]
+
+
+def widened(grid):
+    """The same cells in a field of view of at least 256 m in all directions."""
+    far = np.ceil(256.0 / np.broadcast_to(grid.cell_m, 3)) * grid.cell_m
+    return replace(grid, minimum_m=tuple(-far), maximum_m=tuple(far))
+
+
+def test_a_wider_field_of_view_holds_whole_cells_of_unequal_edges():
+    grid = ScanGrid((-36.0, -30.0, -4.0), (36.0, 30.0, 4.0), cell_m=(0.6, 0.5, 0.8))
+    assert widened(grid).cells == (854, 1024, 640)
 
 
 @pytest.mark.parametrize("name", ["batch1", "batch2"])

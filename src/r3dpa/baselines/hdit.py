@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
@@ -17,7 +17,7 @@ from einops import rearrange
 from einops.layers.torch import Rearrange
 from torch import Tensor, nn
 
-from r3dpa.baselines.efficient_unet import Blocks, hdl64e_angles
+from r3dpa.baselines.efficient_unet import Blocks, Encoding, encode_angles, hdl64e_angles
 from r3dpa.baselines.neighbourhood import neighbourhood_attention
 from r3dpa.nn.layers import Size, at_least_float32, zeroed
 
@@ -45,7 +45,10 @@ class HDiT(nn.Module):
         depths: Blocks of each level, on the way down and again on the way up; last, of the middle.
         num_heads: Attention heads of each level.
         mlp_ratio: Width of the feed-forward layers in units of the token width.
-        mapping_depth: Feed-forward layers of the time embedding.
+        mapping_depth: Feed-forward layers of the time embedding, and of the position embedding
+            where that is a network.
+        positional_embedding: ``learnable_embedding``: a vector per token; otherwise a network of
+            the ray angles, encoded as in :func:`~r3dpa.baselines.efficient_unet.encode_angles`.
 
     Raises:
         ValueError: If tokens of the last level do not divide the image.
@@ -65,6 +68,7 @@ class HDiT(nn.Module):
         num_heads: Sequence[int] = (2, 4, 8, 16),
         mlp_ratio: float = 3.0,
         mapping_depth: int = 2,
+        positional_embedding: Literal["learnable_embedding"] | Encoding = "learnable_embedding",
     ) -> None:
         super().__init__()
         levels = len(depths) - 1
@@ -74,14 +78,16 @@ class HDiT(nn.Module):
         self.resolution, self.in_channels, self.patch_size = resolution, in_channels, patch_size
         self.register_buffer("coords", hdl64e_angles(resolution))
         grid = resolution[0] // patch_size[0], resolution[1] // patch_size[1]
-        embedding = nn.init.trunc_normal_(torch.empty(1, *grid, base_channels), std=0.02)
-        self.spatial_pe = nn.ParameterDict({"embedding": embedding})
-        hidden = int(time_channels * mlp_ratio)
-        mapping = [_FeedForward(time_channels, hidden) for _ in range(mapping_depth)]
-        self.timestep_pe = nn.Sequential(
-            _TimeFeatures(time_channels),
-            nn.Sequential(_RmsNorm(time_channels), *mapping, _RmsNorm(time_channels)),
-        )
+        self.spatial_pe: nn.Module
+        if positional_embedding == "learnable_embedding":
+            self.spatial_pe = _LearnedPositions(base_channels, grid)
+        else:
+            self.spatial_pe = nn.Sequential(
+                _EncodedAngles(base_channels, grid, positional_embedding),
+                _mapping(base_channels, mlp_ratio, mapping_depth),
+            )
+        time_mapping = _mapping(time_channels, mlp_ratio, mapping_depth)
+        self.timestep_pe = nn.Sequential(_TimeFeatures(time_channels), time_mapping)
         self.tokenizer = nn.Sequential(
             nn.Conv2d(in_channels, base_channels, patch_size, patch_size, bias=False),
             Rearrange("B D h w -> B h w D"),
@@ -114,7 +120,7 @@ class HDiT(nn.Module):
         """Velocity ``(B, C, H, W)`` of images ``(B, C, H, W)`` at times ``(B,)`` (0 data)."""
         embedding = self.timestep_pe(time)
         angles = [F.avg_pool2d(self.coords, self.patch_size, self.patch_size)]
-        hidden = self.tokenizer(image) + self.spatial_pe["embedding"]
+        hidden = self.tokenizer(image) + self.spatial_pe(angles[0])
         skipped = []
         for level in range(len(self.down_levels) // 2):
             hidden = self.down_levels[f"level_{level}"](hidden, angles[-1], embedding)
@@ -148,6 +154,33 @@ class _TimedRmsNorm(nn.Module):
         return _rms_normalised(tokens).to(tokens.dtype) * (1 + self.proj(embedding))
 
 
+class _LearnedPositions(nn.Module):
+    """One learned vector per token."""
+
+    def __init__(self, width: int, grid: Size) -> None:
+        super().__init__()
+        self.embedding = nn.Parameter(torch.empty(1, *grid, width))
+        nn.init.trunc_normal_(self.embedding, std=0.02)
+
+    def forward(self, angles: Tensor) -> Tensor:
+        return self.embedding
+
+
+class _EncodedAngles(nn.Module):
+    """Linear map of encoded ray angles ``(1, 2, h, w)`` to ``(1, h, w, D)``."""
+
+    def __init__(self, width: int, grid: Size, encoding: Encoding) -> None:
+        super().__init__()
+        self.grid, self.encoding = grid, encoding
+        with torch.device("cpu"):  # also where networks are built without memory
+            encoded = encode_angles(torch.zeros(1, 2, 1, 1), encoding, grid)
+        self.linear = _linear(encoded.shape[1], width)
+
+    def forward(self, angles: Tensor) -> Tensor:
+        encoded = encode_angles(angles, self.encoding, self.grid)
+        return self.linear(rearrange(encoded, "B E h w -> B h w E"))
+
+
 class _TimeFeatures(nn.Module):
     """Linear map of cosines and sines of ``2 pi t f`` at fixed random frequencies."""
 
@@ -179,6 +212,12 @@ class _FeedForward(nn.Module):
         normalised = self.adarms(tokens, *time) if time else self.norm(tokens)
         values, gate = self.gegelu(normalised).chunk(2, dim=-1)
         return tokens + self.linear(values * F.gelu(gate))
+
+
+def _mapping(width: int, mlp_ratio: float, depth: int) -> nn.Sequential:
+    """Feed-forward layers between two norms."""
+    layers = [_FeedForward(width, int(width * mlp_ratio)) for _ in range(depth)]
+    return nn.Sequential(_RmsNorm(width), *layers, _RmsNorm(width))
 
 
 class _RotaryEmbedding(nn.Module):

@@ -77,6 +77,8 @@ class VQAutoencoder(VAE):
         channels: Base width.
         legacy_upsample: Interpolation of the released weights, see :class:`r3dpa.nn.VAE`.
         legacy_codebook: See :class:`Codebook`.
+        z_channels: Channels of the encoder's output and the decoder's input, as LiDM names them;
+            None for as many as the latents and codes have.
         **sizes: Further arguments of :class:`r3dpa.nn.VAE`.
     """
 
@@ -87,13 +89,19 @@ class VQAutoencoder(VAE):
         channels: int = 64,
         legacy_upsample: bool = True,
         legacy_codebook: bool = True,
+        z_channels: int | None = None,
         **sizes: Any,
     ) -> None:
         super().__init__(channels=channels, legacy_upsample=legacy_upsample, **sizes)
         width = self.latent_channels
+        outside = z_channels or width
         deepest = self.encoder.get_parameter("conv_out.weight").shape[1]
-        self.encoder.conv_out = CircularConv2d(deepest, width, (3, 3))
-        self.quant_conv = nn.Conv2d(width, width, 1)
+        self.encoder.conv_out = CircularConv2d(deepest, outside, (3, 3))
+        self.quant_conv = nn.Conv2d(outside, width, 1)
+        if outside != width:
+            self.post_quant_conv = nn.Conv2d(width, outside, 1)
+            deepest = len(self.decoder.get_parameter("conv_in.weight"))
+            self.decoder.conv_in = CircularConv2d(outside, deepest, (3, 3))
         self.quantize = Codebook(num_codes, width, legacy_codebook)
         if mask:
             self.decoder.conv_out = Float32CircularConv2d(channels, 2, (1, 4))

@@ -54,6 +54,8 @@ def from_lidm(
     first = found.get("first_stage") or found["network"]
     sizes = vae_sizes(first) | {
         "num_codes": len(first[_MARK]),
+        "latent_channels": first["post_quant_conv.weight"].shape[1],
+        "z_channels": len(first["post_quant_conv.weight"]),
         "mask": len(first["decoder.conv_out.weight"]) == 2,
     }
     networks, settings = {}, {}

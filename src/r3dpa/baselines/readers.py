@@ -43,6 +43,7 @@ _UNET_ARGUMENTS = (
 )
 #: Constants that are buffers there and formulas here.
 _CONSTANTS = re.compile(r"(^_dummy|\.scale|\.kernel|^coords_encoding\.(freqs|phase))$")
+_HDIT_CONSTANTS = "spatial_pe.0.embedding."
 
 
 def read_baseline(
@@ -75,6 +76,11 @@ def unet_weights(official: StateDict) -> dict[str, Tensor]:
                 key = re.sub(pattern, ours, key)
             weights[key] = value
     return weights
+
+
+def hdit_weights(official: StateDict) -> dict[str, Tensor]:
+    """Weights of an official ``HDiT``, whose names are ours, without constants."""
+    return {key: value for key, value in official.items() if not key.startswith(_HDIT_CONSTANTS)}
 
 
 def is_r2dm(content: Any) -> bool:
@@ -163,6 +169,8 @@ def from_r2flow(content: Mapping[str, Any], path: Path) -> Checkpoint:
         init_args["time_channels"] = model["temb_channels"]
         init_args["depths"] = _plain(model["num_residual_blocks"])
         init_args["num_heads"] = _plain(model["attn_num_heads"])
+        init_args["positional_embedding"] = model["coords_encoding"]
+        weights = hdit_weights(weights)
     else:
         init_args |= {name: _plain(model[name]) for name in _UNET_ARGUMENTS}
         weights = unet_weights(weights)

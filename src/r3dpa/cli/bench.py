@@ -125,7 +125,9 @@ def ablate(
     from r3dpa.cli.presets import shipped
     from r3dpa.io import only_writer
 
-    tables = shipped(tables) if tables.is_dir() or tables.suffix else shipped(f"{tables}.yaml")
+    tables = shipped(tables)
+    if not tables.is_dir() and not tables.suffix:
+        tables = shipped(f"{tables}.yaml")
     scale_file = Path(scale)
     if scale_file.suffix not in (".yaml", ".yml"):
         parent = tables if tables.is_dir() else tables.parent
