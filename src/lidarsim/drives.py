@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from lidarsim.drive_files import DriveFiles, drive_name, to_json, weather_to_dict, write
-from lidarsim.io import differences, in_processes, only_writer, text_table
+from lidarsim.io import differences, in_processes, json_values, only_writer, text_table
 from lidarsim.scan import Simulator, check_switches
 from lidarsim.scene import Conditions, Semantic
 from lidarsim.sensors.spinning import SpinningLidar, load_sensor
@@ -138,7 +138,7 @@ def simulate(
         "seed": seed,
         "scans": scans,
         "drives": list(names),
-        "sensor": json.loads(json.dumps(asdict(sensor))),  # lists instead of tuples
+        "sensor": json_values(asdict(sensor)),
         "effects": check_switches(effects or {}),
         "weather": None if weather is None else weather_to_dict(weather),
     }
@@ -155,7 +155,7 @@ def simulate(
         holds_more = _check_folder(out, request)
         if not holds_more:
             write(out / _MANIFEST, to_json(request))
-        classes = "".join(f"{int(one)}: {one.name.lower()}\n" for one in Semantic)
+        classes = "".join(f"{int(semantic)}: {semantic.name.lower()}\n" for semantic in Semantic)
         write(out / _CLASSES, classes.encode())
         tasks = []
         for drive, count in files.items():
@@ -168,7 +168,7 @@ def simulate(
         with tqdm(total=scans, initial=complete, unit="scan", desc="simulate", disable=None) as bar:
             for num_written in in_processes(_run, tasks, workers):
                 bar.update(num_written)
-        if holds_more:  # whose poses and report are those of all scans
+        if holds_more:  # whose poses and report cover all scans
             return _report_of(files, num_missing)
         return _finish(out, files, num_missing)
 
@@ -275,7 +275,7 @@ def _finish(out: Path, files: Mapping[DriveFiles, int], num_written: int) -> Sim
 
 
 def _report_of(files: Mapping[DriveFiles, int], num_written: int) -> SimulationReport:
-    summaries = [one for drive, count in files.items() for one in drive.summaries(count)]
+    summaries = [summary for drive, count in files.items() for summary in drive.summaries(count)]
     return make_report(summaries, num_written)
 
 

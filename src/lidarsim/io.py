@@ -84,7 +84,7 @@ def _fsync(path: Path) -> None:
 
 
 def no_follow(path: str, flags: int) -> int:
-    """``opener`` for :func:`open`: a symbolic link is an ``OSError``, not the file it leads to."""
+    """``opener`` for :func:`open` that raises ``OSError`` for a symbolic link."""
     return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0), 0o666)
 
 
@@ -149,6 +149,12 @@ def append(file: FileIO, data: bytes) -> None:
     except OSError as error:
         error.filename = str(file.name)
         raise
+
+
+def json_values(values: Any, default: Callable[[Any], Any] | None = None) -> Any:
+    """Return values as a JSON file holds them: lists for tuples, text for numbers as keys."""
+    text = json.dumps(values, default=default)
+    return json.loads(text)
 
 
 def differences(stored: Any, wanted: Any, name: str = "") -> Iterator[str]:

@@ -314,7 +314,7 @@ def normals(
 
 
 def _draws_of(index: int, window: tuple[slice, slice], drawn: Floats) -> Floats:
-    """Draws of a window for one solid: those of the turn, shifted from solid to solid."""
+    """Draws of a window for one solid: the draws of the turn, shifted from solid to solid."""
     num_beams, num_shots = drawn.shape
     beams = np.arange(window[0].start, window[0].stop) + _BEAM_STRIDE * index
     shots = np.arange(window[1].start, window[1].stop) + _SHOT_STRIDE * index

@@ -185,21 +185,21 @@ def scale_of(intensity: NDArray | None, full: float | None = None) -> IntensityS
     is_integer = intensity is not None and intensity.dtype.kind in "iu"
     largest = high if high <= 1 else float(np.quantile(values, 0.999))
     if largest <= 1 and not is_integer:
-        found, unit = 1.0, "0..1"
+        scale, unit = 1.0, "0..1"
     elif largest <= 255:
-        found, unit = 255.0, "0..255"
+        scale, unit = 255.0, "0..255"
     else:
-        found, unit = largest, "instrument units"
-    found = full or found
-    off_grid = {s: np.abs(values / s - np.round(values / s)).max() for s in (found / 100, 1.0)}
-    step = next((s for s, most in off_grid.items() if found > s and most < 1e-3), 0.0)
+        scale, unit = largest, "instrument units"
+    scale = full or scale
+    off_grid = {s: np.abs(values / s - np.round(values / s)).max() for s in (scale / 100, 1.0)}
+    step = next((s for s, most in off_grid.items() if scale > s and most < 1e-3), 0.0)
     steps = f" in steps of {step:g}" if step else ""
-    text = f"intensity {low:g}..{high:g}{steps}: {unit}, full scale {found:g}"
-    return IntensityScale(found, step, True, text)
+    text = f"intensity {low:g}..{high:g}{steps}: {unit}, full scale {scale:g}"
+    return IntensityScale(scale, step, True, text)
 
 
 def _shares(scan: RecordedScan, scale: IntensityScale) -> Floats:
-    """Intensities ``(P,)`` over that of a white surface, at most 1."""
+    """Intensities ``(P,)`` over the intensity of a white surface, at most 1."""
     if scan.intensity is None or not scale.known:
         return np.full(len(scan), _UNKNOWN_INTENSITY, dtype=np.float32)
     shares: Floats = (scan.intensity / scale.full).astype(np.float32).clip(max=1)

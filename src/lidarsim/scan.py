@@ -72,7 +72,7 @@ def check_switches(switches: Mapping[str, str | bool]) -> dict[str, str]:
     names = [effect_name(effect) for effect in EFFECTS]
     for name, switch in switches.items():
         if name not in names:
-            raise ValueError(f"there is no effect {name!r}; there are {', '.join(names)}")
+            raise ValueError(f"unknown effect {name!r}; choose from {', '.join(names)}")
         if switch not in ("auto", "on", "off", True, False):
             raise ValueError(f"effect {name} must be auto, on or off, got {switch!r}")
     return {name: "off" for name in sorted(switches) if switches[name] in ("off", False)}

@@ -59,7 +59,7 @@ class ScanStatistics:
     """Counts over scans; ``a + b`` holds the counts of both. Arrays are float64.
 
     Returns are the points between 1 and 80 m, so dummies at the origin are not counted. "Ring
-    order" is that of KITTI files, beam after beam. Counts that a scan cannot give are zero.
+    order" is as in KITTI files, beam after beam. Counts that a scan cannot give are zero.
     Surfaces are (ground, upright).
     """
 
@@ -221,10 +221,10 @@ def _count_rings(s: ScanStatistics, range_m: Floats, sweep: Sweep, incidence_deg
     middle_m = (range_m[left] + range_m[right]) / 2
     angle_deg = (incidence_deg[:, left] + incidence_deg[:, right]) / 2
     surface, pair = np.isfinite(angle_deg).nonzero()
-    own: dict[str, Any] = {"weight": weight[pair]}
+    weights: dict[str, Any] = {"weight": weight[pair]}
     s.count("keep_by_range", middle_m, outcome, weight=weight)
-    s.count("surface_keep_by_range", surface, middle_m[pair], outcome[pair], **own)
-    s.count("keep_by_incidence", surface, angle_deg[surface, pair], outcome[pair], **own)
+    s.count("surface_keep_by_range", surface, middle_m[pair], outcome[pair], **weights)
+    s.count("keep_by_incidence", surface, angle_deg[surface, pair], outcome[pair], **weights)
 
 
 def _count_beams(

@@ -63,7 +63,7 @@ class Sweep(NamedTuple):
         close = np.abs(key[index] - wanted) < 1.5 * self.shot_rad
         return index, close & (self.ring[index] == self.ring + step)
 
-    def turned(self, start: Indices, end: Indices) -> Floats:
+    def azimuth_between(self, start: Indices, end: Indices) -> Floats:
         """Azimuth from each return ``start`` forward to ``end``, radians in [-0.1, 2 pi - 0.1)."""
         return _forward(self.azimuth[end] - self.azimuth[start])
 
@@ -178,12 +178,12 @@ def _on_line(range_m: Floats, sweep: Sweep) -> Mask:
     The inner ones and the return itself are not tested: that would cut the tails of the residuals.
     """
     first, last = sweep.neighbour(-_REACH), sweep.neighbour(_REACH)
-    whole = sweep.turned(first, last)
+    whole = sweep.azimuth_between(first, last)
     smooth = (whole > 0) & (whole < 2 * (_REACH + MAX_GAP_SHOTS) * sweep.shot_rad)
     shots = np.maximum(np.rint(whole / sweep.shot_rad).astype(np.int64), 1)
     smooth &= level_enough(range_m[first], range_m[last], shots)
     for inner in (sweep.neighbour(1 - _REACH), sweep.neighbour(_REACH - 1)):
-        share = sweep.turned(first, inner) / np.where(whole > 0, whole, 1.0)
+        share = sweep.azimuth_between(first, inner) / np.where(whole > 0, whole, 1.0)
         line = range_m[first] + share * (range_m[last] - range_m[first])
         smooth &= np.abs(range_m[inner] - line) < _SMOOTH_M
     return smooth
@@ -192,12 +192,12 @@ def _on_line(range_m: Floats, sweep: Sweep) -> Mask:
 def _residual(range_m: Floats, sweep: Sweep) -> Floats:
     """Range minus the line through both neighbours along the ring, NaN next to a lost shot.
 
-    Divided by the error growth of that line: the deviation is that of a single range.
+    Divided by the error growth of this line, it deviates as a single range does.
     """
     before, after = sweep.neighbour(-1), sweep.neighbour(1)
-    whole = sweep.turned(before, after)
+    whole = sweep.azimuth_between(before, after)
     unbroken = (sweep.missing[before] == 0) & (sweep.missing == 0) & (whole > 0)
-    share = sweep.turned(before, np.arange(len(before))) / np.where(unbroken, whole, 1.0)
+    share = sweep.azimuth_between(before, np.arange(len(before))) / np.where(unbroken, whole, 1.0)
     line = range_m[before] + share * (range_m[after] - range_m[before])
     growth = np.sqrt(1 + share**2 + (1 - share) ** 2)
     return np.where(unbroken & (share > 0) & (share < 1), (range_m - line) / growth, np.nan)

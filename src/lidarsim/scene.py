@@ -37,7 +37,7 @@ def check_fields(values: object, rule: Rule, *names: str) -> None:
 
 
 class Semantic(IntEnum):
-    """Class ids of the labels, those of KITTI-360."""
+    """Class ids of the labels, as in KITTI-360."""
 
     UNLABELED = 0
     EGO_VEHICLE = 1

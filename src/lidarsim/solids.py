@@ -113,7 +113,7 @@ def windows_of(
     """Beams and shots whose rays can meet each solid, from its bounding box seen from above.
 
     The first pass takes the rays to start anywhere that any of them does, which a moving sensor
-    spreads over a metre; the second looks up where those of the first window really start.
+    spreads over a metre; the second looks up where the rays of the first window really start.
     """
     fan = _fan(origin, direction)
     reach = np.zeros(len(solids.shape))

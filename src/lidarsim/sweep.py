@@ -196,7 +196,7 @@ class Sweep:
         surface: NDArray[np.int32] | None = None,
         ego: float = 0,
     ) -> NDArray:
-        """Values ``(M,)`` of surfaces, by default those of the cast, 0 for ``NO_SURFACE``.
+        """Values ``(M,)`` of surfaces, by default the cast ones, 0 for ``NO_SURFACE``.
 
         ``values``: one per primitive of the scene. ``ego``: of the recording car.
         """
@@ -303,7 +303,7 @@ class Sweep:
         """
         codes = [p.semantic | p.instance << 16 for p in self.scene.primitives]
         coded = self.of_surface(codes, Semantic.ROAD, np.uint32, surface, Semantic.EGO_VEHICLE)
-        # Other echoes from the air have no surface; those of a halo keep that of their sheet.
+        # Other echoes from the air have no surface; echoes of a halo keep the label of their sheet.
         coded[origin == Origin.BLOOMING] = Semantic.UNLABELED
         return coded
 

@@ -14,8 +14,8 @@ from r3dpa.baselines.diffusion import sample_errors
 from r3dpa.baselines.hdit import HDiT, _RotaryEmbedding
 from r3dpa.baselines.neighbourhood import neighbourhood_attention
 from r3dpa.baselines.r2flow import distilled_times
-from r3dpa.baselines.readers import from_r2flow, image_geometry, time_reversed, unet_weights
-from r3dpa.baselines.reflow import as_scanned
+from r3dpa.baselines.readers import from_r2flow, image_geometry, reverse_time, unet_weights
+from r3dpa.baselines.reflow import clamp_to_sensor
 from r3dpa.flow import Interpolant, sample_time
 from r3dpa.flow.interpolant import _exponential
 from r3dpa.flow.solvers import ab3, euler
@@ -44,7 +44,7 @@ def hdit(baseline_case):
     """Case and network; its weights are translated."""
     case = baseline_case("r2flow_hdit")
     network = hdit_of(case.config)
-    network.load_state_dict(time_reversed(case.weights()))
+    network.load_state_dict(reverse_time(case.weights()))
     return case, network
 
 
@@ -70,7 +70,7 @@ def outputs_of(case, network):
 def gradients_of(network, loss, **options):
     loss.backward(**options)
     own = {name: p.grad for name, p in network.named_parameters()}
-    found = time_reversed(own | dict(network.named_buffers()))
+    found = reverse_time(own | dict(network.named_buffers()))
     network.zero_grad()
     return found
 
@@ -149,7 +149,7 @@ def unet_of(kind, case):
     config = {key: value for key, value in case.config.items() if key not in ("seed", "ring")}
     assert case.config["ring"]
     network = kind(**config)
-    network.load_state_dict(unet_weights(time_reversed(case.weights())))
+    network.load_state_dict(unet_weights(reverse_time(case.weights())))
     return network
 
 
@@ -259,7 +259,7 @@ def reflow_of(case, network, geometry):
     noise = torch.stack([torch.randn(shape, generator=draw) for draw in draws])
     data = euler(network, noise, ode_times(4))
     sensor = geometry.projection.sensor
-    pairs = as_scanned(data, geometry)
+    pairs = clamp_to_sensor(data, geometry)
     range_m = geometry.codec.ranges_of(pairs, sensor).clamp(min=0)
     results = {
         "out/reflow_x_0_cpu": noise,

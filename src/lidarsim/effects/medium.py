@@ -138,7 +138,7 @@ class Spray(Effect):
         backscatter * min(c tau / 2, L) * xi(r) / r^2
 
     Source: 0.05 to 0.2 per metre in the plumes of cars at 60 to 90 km/h; the depth at which a road
-    counts as flooded is that of wet-ground models.
+    counts as flooded comes from wet-ground models.
 
     Args:
         max_extinction_per_m: Extinction behind a vehicle at 20 m/s or more on a flooded road.
@@ -368,7 +368,7 @@ class Rain(_Hydrometeors):
 class Snow(_Hydrometeors):
     """Snow attenuates every echo, and flakes may outshine weak targets.
 
-    Equations: :class:`_Hydrometeors`. Diameters are those of the molten flakes. Ice
+    Equations: :class:`_Hydrometeors`. Diameters are of the molten flakes. Ice
     crystals return 2 pi / S = 0.3 of the echo of a white disk, with S = 20 sr their ratio of
     extinction to backscatter. At 1 mm/h the extinction is 1.4e-3 per metre.
 

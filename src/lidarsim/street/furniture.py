@@ -16,7 +16,7 @@ from lidarsim.street.builder import FOOTING_M, Builder
 from lidarsim.street.trees import LEAVES
 from lidarsim.street.vehicles import DIRT, bicycle
 
-# Lamps: those of roads on masts of 5 to 9 m, those of paths and squares of 3.2 to 4.2 m; the foot
+# Lamps of roads stand on masts of 5 to 9 m, of paths and squares on 3.2 to 4.2 m; the foot
 # of a mast, behind whose door the fuses are, is thicker up to 0.9 m.
 _MAST_M, _LOW_MAST_M, _FOOT_M = (5.0, 9.0), (3.2, 4.2), (0.18, 0.9)
 # Posts of signs are tubes of 60 or 76 mm; sheets have edges or diameters of 0.42 to 0.9 m and hang

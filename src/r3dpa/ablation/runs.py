@@ -45,8 +45,8 @@ class Job(NamedTuple):
     def done(self) -> bool:
         """Whether it ended well with these settings."""
         mark = self.place.with_suffix(".done")
-        made = self.makes is None or self.makes.is_file()
-        return made and mark.is_file() and mark.read_text(encoding="utf-8") == self.content
+        has_result = self.makes is None or self.makes.is_file()
+        return has_result and mark.is_file() and mark.read_text(encoding="utf-8") == self.content
 
     @property
     def log(self) -> Path:
@@ -204,8 +204,8 @@ def _test_job(stage: Stage, reference: Path, of_reference: str) -> Job:
 
 
 def _stage_words(stage: Stage) -> list[str]:
-    own = ["--run_dir", str(stage.folder), "--trainer.enable_progress_bar", "false"]
-    return [*stage.words, *own]
+    options = ["--run_dir", str(stage.folder), "--trainer.enable_progress_bar", "false"]
+    return [*stage.words, *options]
 
 
 def _released_jobs(

@@ -15,7 +15,7 @@ class ADMUNet(EfficientUNet):
     """U-Net of residual blocks that resample between their norm and their first convolution.
 
     Every block on the way down is concatenated to one on the way up; the lowest level and the
-    middle have attention. Arguments and ``coords`` are those of :class:`EfficientUNet`.
+    middle have attention. Arguments and ``coords`` as in :class:`EfficientUNet`.
 
     Source: Dhariwal and Nichol 2021, as in R2Flow (Nakashima et al. 2025).
     """

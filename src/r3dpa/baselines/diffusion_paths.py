@@ -176,8 +176,8 @@ def repaint(
             for here, there in pairwise(times):
                 noised = path.interpolate(known, next(draws), there)
                 data = path.denoise(velocity(x, here), x, here)
-                made = ancestral_step(data, x, here, there, next(draws), interpolant=path)
-                x = mask * noised + (1 - mask) * made
+                generated = ancestral_step(data, x, here, there, next(draws), interpolant=path)
+                x = mask * noised + (1 - mask) * generated
             if index == steps - 1 or crossing == resamplings - 1:
                 break
             for here, there in pairwise(reversed(times)):

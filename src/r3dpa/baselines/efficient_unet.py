@@ -34,7 +34,7 @@ class Shared(NamedTuple):
 
 
 class EfficientUNet(nn.Module):
-    """U-Net of R2DM; that of R2Flow is the same with times of a flow.
+    """U-Net of R2DM, and of R2Flow with times of a flow.
 
     Four levels, each half the size of the one before, with attention at the lowest. Columns wrap
     around, rows are padded with zeros.
@@ -55,8 +55,8 @@ class EfficientUNet(nn.Module):
         ring: Wrap columns around; else they are padded with zeros as well.
 
     Attributes:
-        coords: ``(1, 2, H, W)`` inclination and azimuth of the rays, radians; those of the upper
-            left pixel corners of an HDL-64E, until other weights or data set them.
+        coords: ``(1, 2, H, W)`` inclination and azimuth of the rays, radians; rays through the
+            upper left pixel corners of an HDL-64E, until other weights or data set them.
     """
 
     coords: Tensor
@@ -269,7 +269,7 @@ class Resample(nn.Module):
 def sinusoid(time: Tensor, width: int, max_period: float = 10_000.0) -> Tensor:
     """Features ``(B, width)`` of times ``(B,)``: sines, then cosines.
 
-    Frequencies fall from 1 to exactly ``1 / max_period``, unlike those of
+    Frequencies fall from 1 to exactly ``1 / max_period``, unlike in
     :func:`r3dpa.nn.velocity_network.time_frequencies`.
     """
     half = width // 2
@@ -313,10 +313,10 @@ def encode_angles(angles: Tensor, encoding: Encoding | None, size: Size) -> Tens
 def spherical_harmonics(angles: Tensor) -> Tensor:
     """Real spherical harmonics ``(1, 25, H, W)`` of degrees 0 to 4 in the direction of the rays.
 
-    Orders of a degree run from -l to l. The y axis is that of the official code, to the right.
+    Orders of a degree run from -l to l. The y axis points to the right, as in the official code.
     """
     sine, azimuth = angles[:, 0].double().sin(), -angles[:, 1].double()
-    found = []
+    harmonics = []
     for degree in range(5):
         for order in range(-degree, degree + 1):
             m = abs(order)
@@ -328,5 +328,5 @@ def spherical_harmonics(angles: Tensor) -> Tensor:
             factor = (2 - (m == 0)) * (2 * degree + 1) / (4 * math.pi)
             factor *= math.factorial(degree - m) / math.factorial(degree + m)
             wave = (m * azimuth).sin() if order < 0 else (m * azimuth).cos()
-            found.append(math.sqrt(factor) * legendre * wave)
-    return torch.stack(found, dim=1).to(angles.dtype)
+            harmonics.append(math.sqrt(factor) * legendre * wave)
+    return torch.stack(harmonics, dim=1).to(angles.dtype)

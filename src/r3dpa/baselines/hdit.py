@@ -1,7 +1,7 @@
 """HDiT, the hourglass transformer of R2Flow: neighbourhood attention, global in the middle.
 
 Letters: B batch, C channels, H x W image, h x w tokens of a level, D token width, E width of the
-time embedding. Module names are those of the official state dict.
+time embedding. Module names as in the official state dict.
 """
 
 from __future__ import annotations
@@ -134,7 +134,7 @@ class _RmsNorm(nn.Module):
         self.scale = nn.Parameter(torch.ones(width))
 
     def forward(self, tokens: Tensor) -> Tensor:
-        return (_rms_normalised(tokens) * self.scale).to(tokens.dtype)
+        return (_normalise_rms(tokens) * self.scale).to(tokens.dtype)
 
 
 class _TimedRmsNorm(nn.Module):
@@ -145,7 +145,7 @@ class _TimedRmsNorm(nn.Module):
         self.proj = nn.Sequential(zeroed(_linear(embedding, width)), Rearrange("B D -> B 1 1 D"))
 
     def forward(self, tokens: Tensor, embedding: Tensor) -> Tensor:
-        return _rms_normalised(tokens).to(tokens.dtype) * (1 + self.proj(embedding))
+        return _normalise_rms(tokens).to(tokens.dtype) * (1 + self.proj(embedding))
 
 
 class _TimeFeatures(nn.Module):
@@ -274,6 +274,6 @@ class _Expand(nn.Module):
         return torch.lerp(skipped, fine.to(skipped.dtype), self.alpha.sigmoid().to(skipped.dtype))
 
 
-def _rms_normalised(tokens: Tensor) -> Tensor:
+def _normalise_rms(tokens: Tensor) -> Tensor:
     values = at_least_float32(tokens)
     return F.rms_norm(values, values.shape[-1:], eps=1e-6)

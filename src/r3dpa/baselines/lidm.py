@@ -39,7 +39,7 @@ class ReleasedDDIM(SamplerConfig):
         draws: torch.Generator | Iterable[Tensor],
         interpolant: Interpolant,
     ) -> Tensor:
-        """As :meth:`SamplerConfig.solve`; the number of steps is that of the list."""
+        """As :meth:`SamplerConfig.solve`; the list determines the number of steps."""
         times = released_times(self.steps)
         eta = self.eta if self.solver == "ddpm" else 0.0
         return ancestral(velocity, noise, times, draws, eta=eta, interpolant=interpolant)

@@ -1,7 +1,7 @@
 """Networks of LiDM: vector-quantised autoencoder, discriminators, U-Net without alignment.
 
-Encoder, decoder and U-Net are those of R3DPA, which took them from LiDM. Letters: B batch, C latent
-channels, H x W image size, h x w latent size.
+Encoder, decoder and U-Net are the same as in R3DPA, which took them from LiDM. Letters: B batch,
+C latent channels, H x W image size, h x w latent size.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class VQAutoencoder(VAE):
     The diffusion model works on them before that. With ``mask`` the decoder has a second output,
     below 0 where a pixel is empty.
 
-    Source: Ran et al. (CVPR 2024). State-dict keys are those of the released checkpoints.
+    Source: Ran et al. (CVPR 2024). State-dict keys as in the released checkpoints.
 
     Args:
         num_codes: Vectors of the codebook.

@@ -23,7 +23,7 @@ class R2Flow(Baseline):
 
     Trained on scans it is the 1-rectified flow. Trained on pairs of noise and the scene that a
     trained flow makes of it, see :class:`r3dpa.baselines.ReflowPairs`, it becomes straighter
-    (2-rectified flow); with ``num_steps`` it learns the velocities at the times of that many Euler
+    (2-rectified flow); with ``num_steps`` it learns the velocities at the times of these Euler
     steps alone (timestep distillation).
 
     Source: Nakashima et al., "Fast LiDAR Data Generation with Rectified Flows" (ICRA 2025).

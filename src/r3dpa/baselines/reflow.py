@@ -58,7 +58,7 @@ class ReflowPairs(LoaderModule):
         sampler: Solver and steps. Official: dopri5 with a tolerance of 1e-5, about 160 evaluations.
         num_held_out: Pairs, the last ones, for validation and test alone.
         generation_batch: Scenes that are generated together.
-        device: Where they are generated: ``cpu``, ``auto``, or ``cuda`` for that of the process.
+        device: Where to generate them: ``cpu``, ``auto``, or ``cuda`` for the process's device.
         batch_size: Pairs per batch and process.
         num_workers: Loader processes per training process.
         seed: Seed of the order of training; the pairs do not depend on it.
@@ -90,7 +90,7 @@ class ReflowPairs(LoaderModule):
     def setup(self, stage: str) -> None:
         """Generates the scenes that are missing, and opens the cache."""
         store, pairs = self._store()
-        images = fill_cache(self.trainer, store, pairs, self._generated)
+        images = fill_cache(self.trainer, store, pairs, self._generate_images)
         split = len(pairs) - self.num_held_out
         self.train_set = PairDataset(pairs[:split], images)
         self.val_set = PairDataset(pairs[split:], images)
@@ -105,14 +105,14 @@ class ReflowPairs(LoaderModule):
 
     test_dataloader = val_dataloader
 
-    def _generated(self, pairs: list[Pair]) -> Iterator[Tensor]:
+    def _generate_images(self, pairs: list[Pair]) -> Iterator[Tensor]:
         """Images ``(B, C, H, W)`` of pairs, in order."""
         checkpoint = read_checkpoint(self.checkpoint)
         generator = baseline_generator(checkpoint, self.sampler, device=self.device)
         parts = range(0, len(pairs), self.generation_batch)
         for first in tqdm(parts, "generate", unit="batch", disable=None):
             numbers = [pair.number for pair in pairs[first : first + self.generation_batch]]
-            yield as_scanned(generator.generate(numbers).latents, generator.geometry)
+            yield clamp_to_sensor(generator.generate(numbers).latents, generator.geometry)
 
     def _store(self) -> tuple[Store, list[Pair]]:
         checkpoint = read_checkpoint(self.checkpoint)
@@ -149,7 +149,7 @@ class PairDataset(Dataset[dict[str, Any]]):
         return {"range_image": image, "noise": noise, "index": index, "name": pair.name}
 
 
-def as_scanned(samples: Tensor, geometry: ScanGeometry) -> Tensor:
+def clamp_to_sensor(samples: Tensor, geometry: ScanGeometry) -> Tensor:
     """Samples ``(B, C, H, W)`` as images of a scan: clamped, empty out of the sensor's range.
 
     The official pairs pass through files of metric depth, which does the same.

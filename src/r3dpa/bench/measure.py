@@ -55,7 +55,7 @@ class Comparison:
         return self.repeat.low <= 1 <= self.repeat.high
 
     def over_first(self, name: str) -> Ratio:
-        """Time of a case over that of the first."""
+        """Time of a case over the time of the first case."""
         return Ratio.of(self.seconds[name], next(iter(self.seconds.values())))
 
 

@@ -68,13 +68,13 @@ def report_bad_batches(
             except OSError as error:  # a full disk is no reason to end a run that could go on
                 place = f"not saved: {error}"
         warnings.warn(
-            f"step {module.global_step} was skipped: losses {listed(losses)}; gradient norms "
-            f"{norms}; samples {', '.join(names) or 'without names'} (batch {number}, process "
-            f"{module.global_rank}), {place}",
+            f"step {module.global_step} was skipped: losses {format_values(losses)}; "
+            f"gradient norms {norms}; samples {', '.join(names) or 'without names'} "
+            f"(batch {number}, process {module.global_rank}), {place}",
             stacklevel=2,
         )
 
 
-def listed(values: Mapping[str, float]) -> str:
-    """Names and values in one line."""
+def format_values(values: Mapping[str, float]) -> str:
+    """Write names and values in one line."""
     return ", ".join(f"{name} {value:.3g}" for name, value in values.items()) or "unknown"

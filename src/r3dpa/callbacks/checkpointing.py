@@ -159,7 +159,10 @@ class RunCheckpoint(ModelCheckpoint):
 
 
 def _guard(trainer: L.Trainer) -> StepGuard | None:
-    return next((one for one in cast(Any, trainer).callbacks if isinstance(one, StepGuard)), None)
+    return next(
+        (callback for callback in cast(Any, trainer).callbacks if isinstance(callback, StepGuard)),
+        None,
+    )
 
 
 def _start_next_epoch(trainer: L.Trainer) -> None:

@@ -60,7 +60,7 @@ class SceneScorer(L.Callback):
         split: Of ``data_statistics.npy`` alone; ``val`` where it holds both and none is given.
         spaces: Feature spaces; where None, those that need no file or have one in ``ckpt``.
         ckpt: Official weights by space.
-        protocol: ``default`` or ``published``; where None, that of the reference file, or
+        protocol: ``default`` or ``published``; where None, as the reference file has it, or
             ``default`` without one.
         allow_few: Accept fewer scenes than features: only to try it.
         skip_bad: Leave out scenes that cannot be used, such as those without any return, and
@@ -148,7 +148,7 @@ class SceneScorer(L.Callback):
             statistics = compute_reference(statistics, scans_from, spaces, path, renew=True)
         try:
             comparison = evaluate(
-                self._sampled(pl_module, folder, statistics),
+                self._read_scenes(pl_module, folder, statistics),
                 statistics,
                 spaces,
                 label=folder.absolute().parent.name,
@@ -179,9 +179,11 @@ class SceneScorer(L.Callback):
         """Writes the batches of this process; network evaluations per scene, 0 without any."""
         assert module.ema is not None
         generator = module.scene_generator(self.sampler, self.precision)
-        own = range(0, self.num_scenes, self.batch_size)[trainer.global_rank :: trainer.world_size]
+        batches = range(0, self.num_scenes, self.batch_size)[
+            trainer.global_rank :: trainer.world_size
+        ]
         quiet, nfe = None if trainer.is_global_zero else True, 0
-        for first in tqdm(own, "sampling", unit="batch", disable=quiet):
+        for first in tqdm(batches, "sampling", unit="batch", disable=quiet):
             indices = range(first, min(first + self.batch_size, self.num_scenes))
             scenes = generator.generate(indices, self.seed)
             nfe = scenes.nfe
@@ -208,7 +210,7 @@ class SceneScorer(L.Callback):
             "sampler": asdict(self.sampler),
         }
 
-    def _sampled(
+    def _read_scenes(
         self, module: GenerativeModule | Baseline, folder: Path, statistics: AnyReference
     ) -> Iterator[EvaluationScene]:
         """Scenes of all processes, in order; as points where the reference has other pixels."""

@@ -11,7 +11,7 @@ from jsonargparse.typing import NonNegativeInt, PositiveInt
 from lightning.pytorch.utilities import rank_zero_warn
 from torch import Tensor
 
-from r3dpa.callbacks.bad_batches import listed, report_bad_batches
+from r3dpa.callbacks.bad_batches import format_values, report_bad_batches
 from r3dpa.modules.stage import gradient_norms
 
 
@@ -79,7 +79,7 @@ class StepGuard(L.Callback):
         if scaler and scaler.get_scale() > 1 and not (bad_losses or bad_buffers):
             return
         self.in_a_row += 1
-        values = listed({name: float(norm) for name, norm in pl_module.grad_norms.items()})
+        values = format_values({name: float(norm) for name, norm in pl_module.grad_norms.items()})
         if bad_here or not bad_losses:
             report_bad_batches(pl_module, batches, values, self.saved_batches)
         if self.in_a_row >= self.max_skipped_steps:

@@ -53,11 +53,11 @@ def transfer_rgb(
     rgb, statistics = checkpoint.network("sit"), checkpoint.network("latent_norm")
     if not issubclass(rgb.kind, SiT):
         raise ValueError(
-            f"{checkpoint.path} holds a {rgb.kind.__name__}, but RGB weights are those of a SiT: "
+            f"{checkpoint.path} holds a {rgb.kind.__name__}, but RGB weights must belong to a SiT: "
             "give a checkpoint of stage rgb_pretraining, or an official one"
         )
-    theirs = _grouped(rgb.state_dict, statistics.state_dict)
-    ours = _grouped(sit.state_dict(), latent_norm.state_dict())
+    theirs = _group_weights(rgb.state_dict, statistics.state_dict)
+    ours = _group_weights(sit.state_dict(), latent_norm.state_dict())
     patch = rgb.arguments["patch_size"]
     same_grid = tuple(side // patch for side in rgb.arguments["input_size"]) == sit.grid_size
     init_args = rgb.arguments | {"input_size": sit.input_size}
@@ -116,7 +116,7 @@ def _transfer_result(
     same_grid: bool,
 ) -> tuple[Result, str]:
     """Result of a group of weights and its reason, by the rules of the official tuning stages."""
-    rgb, own = (_largest(groups.get(group, {})) for groups in (theirs, ours))
+    rgb, new = (_largest(groups.get(group, {})) for groups in (theirs, ours))
     embeddings = [_largest(groups["x_embedder"]) for groups in (theirs, ours)]
     channels, patches = ([shape[axis] for shape in embeddings] for axis in (1, 2))
     of_patches = group in ("x_embedder", "final_layer.linear")
@@ -125,17 +125,17 @@ def _transfer_result(
     if of_patches and patches[0] != patches[1]:
         return "fresh", "other patch size"
     if group == "pos_embed" and not same_grid:
-        return "resized", "other token grid: computed for that of this run"
+        return "resized", "other token grid: recomputed for this run"
     if group == "projector" and not keep_projector:
         return "fresh", "not requested"
     if group == "projector" and shapes_of(theirs.get(group, {})) != shapes_of(ours[group]):
         return "fresh", "requested, but its shapes differ"
-    if group == "y_embedder" and own[0] == 1 < rgb[0]:
+    if group == "y_embedder" and new[0] == 1 < rgb[0]:
         return "truncated", "one row here: the first is taken"
     return "kept", "fits"
 
 
-def _grouped(sit: Weights, norm: Weights) -> dict[str, dict[str, Tensor]]:
+def _group_weights(sit: Weights, norm: Weights) -> dict[str, dict[str, Tensor]]:
     """Weights of both networks by the part of their key that decides what happens to them."""
     groups: dict[str, dict[str, Tensor]] = {}
     for key, value in {**sit, **{_NORM + k: v for k, v in norm.items()}}.items():
@@ -153,7 +153,7 @@ def _largest(weights: Weights) -> tuple[int, ...]:
 class WeakModel:
     """Averaged network in evaluation mode on the CPU, with facts about its training.
 
-    Its normalised latents are ``scale * latents + shift`` of those of the model that it guides,
+    Where the model that it guides has normalised ``latents``, it has ``scale * latents + shift``,
     see :func:`r3dpa.flow.renormalised`; ``shift`` is ``(C,)`` float32.
     """
 
@@ -176,7 +176,7 @@ def read_snapshot(
     Args:
         path: File of :class:`r3dpa.callbacks.EMASnapshots`, or any checkpoint with an average.
         strong: Checkpoint of the model to be guided.
-        weights: Whose latent statistics it uses, those of the average or of the last step.
+        weights: Whether it uses the latent statistics of the average or of the last step.
     """
     weak = read_checkpoint(path)
     if not {"ema", "ema_latent_norm"} <= set(weak.networks):
@@ -202,7 +202,7 @@ def read_snapshot(
     shift = ((strong_norm.running_mean - norm.running_mean).double() / deviation).float()
     reason, vae = "", _vae_note(weak)
     if vae is None or vae != _vae_note(strong):
-        reason = "its latents are those of another VAE, as within stage joint"
+        reason = "its latents come from another VAE, as within stage joint"
     elif spread > NORM_TOLERANCE:
         limit = f"{NORM_TOLERANCE:.0%}"
         reason = f"the scales of its latents differ by {spread:.1%} between channels, over {limit}"

@@ -33,7 +33,7 @@ Size = tuple[int, int]
 class TransformerTrunk(nn.Module):
     """Class token, learned positions and pre-norm blocks of a ViT, without the last norm.
 
-    Positions of the training grid ``grid_size`` are resized bilinearly to that of the patches.
+    Positions of the training grid ``grid_size`` are resized bilinearly to the grid of the patches.
 
     Source: ViT (Dosovitskiy et al. 2021); names and order of computation of timm.
     """
@@ -84,7 +84,7 @@ def usual_heads(width: int) -> int:
     """Number of heads of the released ViT of this width, which its weights do not determine."""
     if width % _HEAD_WIDTH:
         raise ValueError(
-            f"tokens of width {width} do not divide into heads of {_HEAD_WIDTH}; give num_heads."
+            f"tokens of width {width} do not divide into heads of {_HEAD_WIDTH}; give num_heads"
         )
     return width // _HEAD_WIDTH
 
@@ -121,7 +121,7 @@ class _Scale(nn.Module):
 class DINOv2(nn.Module):
     """Vision transformer of DINOv2 without registers; the defaults are ViT-B/14.
 
-    State-dict keys and shapes are those of the released ``dinov2_vit{s,b,l}14_pretrain.pth``. The
+    State-dict keys and shapes as in the released ``dinov2_vit{s,b,l}14_pretrain.pth``. The
     features are the normalised patch tokens of the last block; positions are resized by antialiased
     bicubic interpolation.
 
@@ -136,7 +136,7 @@ class DINOv2(nn.Module):
         grid_size: Side of the token grid of the position table.
 
     Attributes:
-        trained: Whether the weights are those of a file.
+        trained: Whether the weights were read from a file.
     """
 
     mean: Tensor

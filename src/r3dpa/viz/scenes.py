@@ -117,7 +117,7 @@ def write_page(
 ) -> Path:
     """Write a page of point clouds, coloured by the classes and origins of the simulator too.
 
-    ``origins`` are further ones; ``options`` those of :func:`r3dpa.viz.scan_page`.
+    ``origins`` are further ones; ``options`` go to :func:`r3dpa.viz.scan_page`.
     """
     made_by = _categories(Origin) | dict(origins or {})
     page = scan_page(scans, title, _categories(Semantic), made_by, **options)
