@@ -113,8 +113,8 @@ def simulate(
             reads, for an HDL-64E; in Python any instrument.
         return_mode: Strongest return of each shot, or the two strongest; default: as the sensor.
         effects: ``off`` or ``auto`` by effect, such as ``--effects.fog off``; default: ``auto``.
-        weather: Of all scans, such as ``--weather.rain_mm_h 10``; default: drawn for each stretch
-            of street.
+        weather: Weather of all scans, such as ``--weather.rain_mm_h 10``; default: drawn for each
+            stretch of street.
 
     Returns:
         Contents of the data set by effect, also written to ``report.json``.
@@ -218,7 +218,7 @@ def _share(scans: int, drives: list[str]) -> dict[str, int]:
 
 
 def _check_folder(out: Path, request: dict[str, Any]) -> bool:
-    """Refuse a folder that holds anything but this data set; whether it is one of more scans."""
+    """Refuse a folder with other data; return whether it holds more scans of this data set."""
     manifest = out / _MANIFEST
     if out.exists() and not out.is_dir():
         raise ValueError(f"{out} is a file; give the folder of the data set")

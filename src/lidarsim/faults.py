@@ -124,9 +124,8 @@ class Fault:
             jitter = generator.normal(0, _JITTER, points.shape) + generator.normal(size=3)
             points = (points + self.amount * jitter).astype(np.float32)
         else:
-            axis, way = (
-                vector / np.linalg.norm(vector) for vector in generator.normal(size=(2, 3))
-            )
+            vectors = generator.normal(size=(2, 3))
+            axis, way = (vector / np.linalg.norm(vector) for vector in vectors)
             turned = Rotation.from_rotvec(np.radians(self.amount) * axis).apply(points)
             points = (turned + _METRES_PER_DEGREE * self.amount * way).astype(np.float32)
         kept = np.flatnonzero(stays)

@@ -233,9 +233,9 @@ def cast_single(
 ) -> tuple[Floats, NDArray[np.int32]]:
     """Nearest surface along M single rays that start anywhere, such as reflected ones.
 
-    Foliage counts as a surface, and the ground is only seen from above. A ray does not see the
-    solid, or ``GROUND``, in ``excluded``, and sees that in ``hollow`` from inside, such as the
-    house behind a window. Returns distance and solid ``(M,)`` as ``cast`` does.
+    Foliage counts as a surface, and the ground is only seen from above. A ray passes through the
+    solid, or ``GROUND``, in ``excluded``, and meets the solid in ``hollow`` from inside, such as
+    the house behind a window. Returns distance and solid ``(M,)`` as ``cast`` does.
     """
     nearest = max_range_m.astype(np.float32)
     surface = np.full(len(nearest), NO_SURFACE, dtype=np.int32)

@@ -1,7 +1,7 @@
 """Recorded scans, and the turn of one on which the effects of the simulator can act.
 
-One ray per point, from the origin of the frame. Of shots without a return nothing is known, so
-that there are no rays for them: no effect gives them an echo.
+One ray per point, from the origin of the frame. Shots without a return are unknown and have no
+ray, so that no effect gives them an echo.
 """
 
 from __future__ import annotations
@@ -119,8 +119,8 @@ class Instrument:
         sensor: Its detection limit, beam, pulse and noise: ``hdl64e``, ``hdl32e``, ``vls128``, a
             calibration file or a :class:`SpinningLidar`; its lasers are not used.
         returns: Which echoes of a shot it reports.
-        full_intensity: Intensity of a white surface in front of it; None: by the 99.9 % quantile of
-            each scan: 1 up to 1 unless the intensities are integers, 255 up to 255, else itself.
+        full_intensity: Intensity of a white surface in front of it. Default: from the 99.9 %
+            quantile q of each scan: 1 if q <= 1 (not for integers), 255 if q <= 255, else q.
         response: ``root``: intensity is the root of the power, corrected for range and damped for
             weak echoes as in KITTI's scans; ``linear``: proportional to the power, corrected for
             range, as in calibrated reflectivities.

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarsim import scan_structure as structure
-from lidarsim.scan_structure import GROUND_BAND_M, Floats, Ground, Indices, Mask, Sweep
+from lidarsim.scan_structure import GROUND_BAND_M, Floats, Ground, Indices, Mask, RingReturns
 from lidarsim.sensors.view import LidarSensor, hit_pixels
 
 
@@ -108,7 +108,7 @@ class ScanStatistics:
         return type(self)(*(getattr(self, name) + getattr(other, name) for name in names))
 
     def count(self, name: str, *columns: NDArray[Any], weight: NDArray[Any] | None = None) -> None:
-        """Adds rows of columns to a table; a column holds indices, or values of a binned axis."""
+        """Add rows to a table; its columns are indices, or values of a binned axis."""
         table, index = getattr(self, name), []
         for axis, column in zip(_AXES[name], columns, strict=True):
             index.append(axis.of(column) if isinstance(axis, Bins) else column.astype(np.int64))
@@ -200,7 +200,9 @@ def _count_ground(s: ScanStatistics, xyz: Floats, ground: Ground) -> None:
     s.count("ground_reach_counts", reach)
 
 
-def _count_rings(s: ScanStatistics, range_m: Floats, sweep: Sweep, incidence_deg: Floats) -> None:
+def _count_rings(
+    s: ScanStatistics, range_m: Floats, sweep: RingReturns, incidence_deg: Floats
+) -> None:
     s.num_ring_scans = 1
     before, after, missing = sweep.neighbour(-1), sweep.neighbour(1), sweep.missing
     s.count("drop_runs", missing[missing > 0])
@@ -228,7 +230,11 @@ def _count_rings(s: ScanStatistics, range_m: Floats, sweep: Sweep, incidence_deg
 
 
 def _count_beams(
-    s: ScanStatistics, distance: Floats, sweep: Sweep, ground: Mask, upright: structure.Upright
+    s: ScanStatistics,
+    distance: Floats,
+    sweep: RingReturns,
+    ground: Mask,
+    upright: structure.Upright,
 ) -> None:
     s.num_beam_scans, s.shots = 1, 2 * math.pi / sweep.shot_rad
     ring, residual_m, step_m = sweep.ring, np.abs(upright.residual_m), upright.step_m

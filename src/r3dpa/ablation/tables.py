@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple
 import torch
 
 from r3dpa import viz
-from r3dpa.ablation.plan import Plan, Row, Stage, Table
+from r3dpa.ablation.plan import Plan, PlannedStage, Row, Table
 from r3dpa.io import command, machine, versions, write_text
 from r3dpa.metrics.results import (
     Evaluation,
@@ -232,7 +232,7 @@ def _log_row(
 ) -> None:
     import wandb  # takes seconds
 
-    stages: list[Stage] = row.stages[seed]
+    stages: list[PlannedStage] = row.stages[seed]
     config = {
         "scale": plan.scale,
         "seed": seed,

@@ -143,7 +143,7 @@ def repaint(
     resamplings: int = 1,
     jump: int = 1,
 ) -> Tensor:
-    """Completes samples whose values are known where the mask is 1.
+    """Complete samples whose values are known where the mask is 1.
 
     Each interval of time is crossed ``resamplings`` times by ancestral steps, with steps back to
     its start between, so that unknown values come to fit the known ones. The last interval is

@@ -51,7 +51,7 @@ class EfficientUNet(nn.Module):
         gn_num_groups: Groups of the group norms.
         gn_eps: Added to their variances.
         attn_num_heads: Heads of the attention.
-        coords_encoding: How the ray angles enter, see :func:`encode_angles`; None: not at all.
+        coords_encoding: Encoding of the ray angles, see :func:`encode_angles`; None for no angles.
         ring: Wrap columns around; else they are padded with zeros as well.
 
     Attributes:
@@ -104,11 +104,14 @@ class EfficientUNet(nn.Module):
         c = [base, *widths]
         self.in_conv: nn.Module = shared.conv(channels, base)
         self.down = nn.ModuleList(
-            Block(c[i], c[i + 1], counts[i], shared, i == last, down=i > 0) for i in range(_LEVELS)
+            ResolutionLevel(c[i], c[i + 1], counts[i], shared, i == last, down=i > 0)
+            for i in range(_LEVELS)
         )
         # Deepest first; the skip of its own level joins every block but that.
         self.up = nn.ModuleList(
-            Block(c[i + 1] * (1 + (i < last)), c[i], counts[i], shared, i == last, up=i > 0)
+            ResolutionLevel(
+                c[i + 1] * (1 + (i < last)), c[i], counts[i], shared, i == last, up=i > 0
+            )
             for i in reversed(range(_LEVELS))
         )
         self.out_conv: nn.Module = zeroed(shared.conv(base, self.in_channels))
@@ -142,8 +145,8 @@ class Blocks(nn.ModuleList):
         return hidden
 
 
-class Block(nn.Module):
-    """A level: step down, residual blocks, attention, step up; those that it has."""
+class ResolutionLevel(nn.Module):
+    """A level: step down, residual blocks, attention, step up; all but the blocks are optional."""
 
     def __init__(
         self,

@@ -67,7 +67,7 @@ class BaselineGenerator:
         return other
 
     def prepare(self) -> None:
-        """Nothing: the first scene costs what the others do."""
+        """Do nothing: the first scene takes as long as the others."""
 
     def velocity(self, x: Tensor, time: Tensor) -> Tensor:
         """Velocity ``(B, C, h, w)`` at times ``(B,)``, in the dtype of ``x``."""
@@ -79,7 +79,7 @@ class BaselineGenerator:
 
     @torch.inference_mode()
     def generate(self, indices: int | Sequence[int], seed: int = 0) -> SceneBatch:
-        """Draws one scene per index; arguments as of :meth:`r3dpa.SceneGenerator.generate`."""
+        """Draw one scene per index; arguments as of :meth:`r3dpa.SceneGenerator.generate`."""
         indices = scene_indices(indices)
         size = self.batch_size or len(indices)
         if len(indices) > size:
@@ -114,7 +114,7 @@ class BaselineGenerator:
         *,
         resamplings: int = 10,
     ) -> SceneBatch:
-        """Completes an encoded range image ``(C, H, W)``, once per index.
+        """Complete an encoded range image ``(C, H, W)``, once per index.
 
         Pixels that are True in ``known`` ``(H, W)`` are kept. ``resamplings`` goes to
         :func:`~r3dpa.baselines.diffusion_paths.repaint`, with the steps of the sampler. Latents

@@ -211,7 +211,7 @@ class _RotaryEmbedding(nn.Module):
         return torch.cat(rotated, dim=-1).to(vectors.dtype)
 
 
-class _Attention(nn.Module):
+class _CosineAttention(nn.Module):
     """Attention by the cosine of rotated queries and keys, in a window or between all tokens."""
 
     def __init__(
@@ -249,13 +249,16 @@ class _Attention(nn.Module):
 
 
 def _blocks(depth: int, attention: tuple[Any, ...], feed_forward: tuple[Any, ...]) -> Blocks:
-    return Blocks(_Block(attention, feed_forward) for _ in range(depth))
+    return Blocks(_TokenBlock(attention, feed_forward) for _ in range(depth))
 
 
-class _Block(nn.Module):
+class _TokenBlock(nn.Module):
     def __init__(self, attention: tuple[Any, ...], feed_forward: tuple[Any, ...]) -> None:
         super().__init__()
-        self.residual_attn, self.residual_ffn = _Attention(*attention), _FeedForward(*feed_forward)
+        self.residual_attn, self.residual_ffn = (
+            _CosineAttention(*attention),
+            _FeedForward(*feed_forward),
+        )
 
     def forward(self, tokens: Tensor, angles: Tensor, embedding: Tensor) -> Tensor:
         return self.residual_ffn(self.residual_attn(tokens, angles, embedding), embedding)

@@ -34,7 +34,7 @@ class LiDMFirstStage(Baseline):
         geometry_factor: Weight of the squared distance of points seen from above.
         adversarial: Ratio of gradient norms, discriminator to reconstruction.
         adversarial_start: Step at which the discriminator begins.
-        released_start: It ends after that step instead, as in the released code.
+        released_start: End the discriminator after that step instead, as in the released code.
         released_geometry: Read ranges from images that are mapped to [0, 1] twice, as in the
             released code, in which empty pixels are at 6.6 m.
         curve_length: Columns that are averaged before points are compared.
@@ -157,7 +157,7 @@ class LiDMFirstStage(Baseline):
         return self.log_loss(torch.stack(list(parts.values())).sum())
 
     def validation_step(self, batch: LidarBatch, batch_idx: int) -> None:
-        """Adds the absolute error of held-out scans through the codebook to the means."""
+        """Add the absolute error of held-out scans through the codebook to the means."""
         image = batch["range_image"]
         decoded = self.network.decode(self.network.encode(image).mean)
         self.held_out.update(

@@ -66,8 +66,8 @@ class Codebook(nn.Module):
 class VQAutoencoder(VAE):
     """First stage of LiDM, whose latents are quantised when they are decoded.
 
-    The diffusion model works on them before that. With ``mask`` the decoder has a second output,
-    below 0 where a pixel is empty.
+    The diffusion model works on latents before quantisation. With ``mask`` the decoder has a
+    second output, below 0 where a pixel is empty.
 
     Source: Ran et al. (CVPR 2024). State-dict keys as in the released checkpoints.
 

@@ -40,16 +40,15 @@ class Pair:
 
     @property
     def cache_key(self) -> ItemKey:
-        """A pair follows from its number, there is no file that could change."""
+        """Key of the cache: the name alone, as a pair has no file that could change."""
         return self.name, 0, 0
 
 
 class ReflowPairs(LoaderModule):
     """Scenes of a trained flow with the noise that each was made of, as training data.
 
-    Scenes that are missing are generated before training, a share by each process; runs with the
-    same checkpoint and sampler use the same. The noise of a pair follows from its number and is
-    not kept.
+    Missing scenes are generated before training, by all processes; runs with the same checkpoint
+    and sampler share them. The noise of a pair is recomputed from its number.
 
     Args:
         root: Folder of the scenes: 524 kB each at 2 x 64 x 1024.
@@ -88,7 +87,7 @@ class ReflowPairs(LoaderModule):
         self.generation_batch, self.device = generation_batch, device
 
     def setup(self, stage: str) -> None:
-        """Generates the scenes that are missing, and opens the cache."""
+        """Generate the scenes that are missing, and open the cache."""
         store, pairs = self._store()
         images = fill_cache(self.trainer, store, pairs, self._generate_images)
         split = len(pairs) - self.num_held_out

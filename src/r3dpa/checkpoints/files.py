@@ -239,7 +239,7 @@ def _neighbour(vae: Path, kind: str) -> Path:
 
 @contextmanager
 def _naming(path: Path) -> Iterator[None]:
-    """Turn what a damaged file raises into a ``ValueError`` that names the file."""
+    """Raise what a damaged file raises as a ``ValueError`` that names the file."""
     try:
         yield
     except (yaml.YAMLError, SafetensorError, *UNPICKLING_ERRORS) as error:

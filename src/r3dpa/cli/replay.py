@@ -51,9 +51,8 @@ def replay(file: Path, ckpt: Path, device: str = "cpu") -> str:
     except RuntimeError as error:  # the shapes of the batch do not fit the networks
         raise ValueError(f"{file} cannot be run with the networks of {ckpt}: {error}") from error
     lines.append(f"losses then: {format_values(saved['losses'])}")
-    lines.append(
-        f"losses now:  {format_values({k: float(v) for k, v in module.logged_losses.items()})}"
-    )
+    losses = {name: float(loss) for name, loss in module.logged_losses.items()}
+    lines.append(f"losses now:  {format_values(losses)}")
     causes = ", ".join(name for name, inputs_finite in broken.items() if inputs_finite) or "none"
     lines.append(f"layers whose output is not finite: {len(broken)}, from finite inputs: {causes}")
     return "\n".join(lines)

@@ -107,7 +107,7 @@ class FolderOptions:
 
 
 @dataclass(frozen=True)
-class _Job:
+class _FolderRun:
     """Change of a run; a call applies it to a scan, writes the result and returns a report line."""
 
     root: Path
@@ -162,7 +162,7 @@ def _run(source: Path, change: Any, request: dict[str, Any], options: FolderOpti
     from r3dpa.data.scans import evenly
 
     root, files = find_files(source)
-    out, job = options.out, _Job(root, change, options)
+    out, job = options.out, _FolderRun(root, change, options)
     paths = {job.name(path): path for path in files}
     request |= {"source": str(root.resolve()), "seed": options.seed}
     request |= {"columns": options.columns, "drop_nan": options.drop_nan}
@@ -280,7 +280,7 @@ def _summary(lines: list[dict[str, Any]], num_now: int, out: Path) -> str:
     return "\n".join([*texts, f"{out / _REPORT} has a line for each{page}"])
 
 
-def _write_page(job: _Job, files: list[Path]) -> None:
+def _write_page(job: _FolderRun, files: list[Path]) -> None:
     """Page of scans, each beside its result."""
     from r3dpa import viz
     from r3dpa.viz.scenes import write_page

@@ -45,7 +45,9 @@ class TransformerTrunk(nn.Module):
         rows, columns = self.grid_size = grid_size
         self.cls_token = nn.Parameter(torch.zeros(1, 1, width))
         self.pos_embed = nn.Parameter(torch.randn(1, 1 + rows * columns, width) * _TABLE_STD)
-        self.blocks = nn.ModuleList(Block(width, num_heads, norm_eps) for _ in range(depth))
+        self.blocks = nn.ModuleList(
+            TransformerBlock(width, num_heads, norm_eps) for _ in range(depth)
+        )
 
     def forward(self, patches: Tensor) -> Tensor:
         """Class token, then row-major tokens, ``(B, 1 + N, D)``, of patches ``(B, D, h, w)``."""
@@ -89,7 +91,7 @@ def usual_heads(width: int) -> int:
     return width // _HEAD_WIDTH
 
 
-class Block(nn.Module):
+class TransformerBlock(nn.Module):
     """Pre-norm transformer block; ``layer_scale`` weights the channels of both branches."""
 
     def __init__(
@@ -156,7 +158,9 @@ class DINOv2(nn.Module):
         self.pos_embed = nn.Parameter(torch.randn(1, 1 + grid_size**2, dim) * 0.02)
         self.mask_token = nn.Parameter(torch.zeros(1, dim))  # of its training; not used here
         self.patch_embed = nn.ModuleDict({"proj": nn.Conv2d(3, dim, _PATCH, stride=_PATCH)})
-        self.blocks = nn.ModuleList(Block(dim, num_heads, _EPS, True) for _ in range(depth))
+        self.blocks = nn.ModuleList(
+            TransformerBlock(dim, num_heads, _EPS, True) for _ in range(depth)
+        )
         self.norm = nn.LayerNorm(dim, _EPS)
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN)[:, None, None], persistent=False)
         self.register_buffer("std", torch.tensor(IMAGENET_STD)[:, None, None], persistent=False)

@@ -31,7 +31,7 @@ _GATE_M, _GATE_SHARE = 0.3, 0.05
 _NOISE_M = 0.01
 _SENSOR_HEIGHT_M = 1.73
 _BANDWIDTH = 2.0  # of the Gaussian kernel, in standard deviations
-_KERNEL_WIDTH = 64  # K: the kernel is met up to 1 / sqrt(K)
+_KERNEL_WIDTH = 64  # K: the error of the kernel is about 1 / sqrt(K)
 #: Mean and standard deviation of the nine `GeometricFeatures.descriptors` over points of real
 #: HDL-64E scans.
 CENTRES = (0.47, 0.67, 0.13, -0.28, 0.23, 0.52, 0.63, 2.3, 0.26)
@@ -86,7 +86,7 @@ class GeometricFeatures(nn.Module):
         and the normal n, the axis of s3, turned towards the sensor:
 
         0. linearity 1 - s2/s1 (1 where the neighbours lie on a line),
-        1. planarity (s2 - s3)/(s2 + 1 cm) (near 1 where they lie on a plane however sampled),
+        1. planarity (s2 - s3)/(s2 + 1 cm) (near 1 where they lie on a plane, at any sampling),
         2. sphericity s3/s1,
         3. n along the horizontal viewing direction, 4. n across it without its sign, which a mirror
         would turn, 5. n upwards,

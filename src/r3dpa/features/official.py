@@ -21,7 +21,7 @@ class FrozenNetwork(nn.Module):
     """Network that stays in evaluation mode: batch statistics would change its features."""
 
     def train(self, mode: bool = True) -> Self:
-        """Stays in evaluation mode."""
+        """Keep evaluation mode, whatever ``mode`` is."""
         return super().train(False)
 
 

@@ -172,7 +172,7 @@ class WaffleIronS(TokenFeatures):
     are described in ``README.md`` beside the weights; see :class:`r3dpa.modules.PointPretraining`.
 
     Args:
-        weights: File written by that training. Default: the one that comes with the package.
+        weights: File written by this training. Default: the file shipped with the package.
         dim: Width D of the features, at least the tokens' width (128 for the shipped weights).
     """
 
@@ -209,7 +209,7 @@ class WaffleIronS(TokenFeatures):
 
 
 def save_weights(path: Path, network: WaffleIron, norm: nn.BatchNorm1d, grid: ScanGrid) -> None:
-    """Writes what :class:`WaffleIronS` reads; ``norm`` has the statistics of the tokens."""
+    """Write what :class:`WaffleIronS` reads; ``norm`` has the statistics of the tokens."""
     state = {f"network.{key}": value for key, value in network.state_dict().items()}
     state |= {f"norm.{key}": value for key, value in norm.state_dict().items()}
     state = {key: value.detach().cpu().contiguous() for key, value in state.items()}
@@ -235,7 +235,7 @@ def _read_weights(path: Path) -> tuple[dict[str, Tensor], WaffleIron, ScanGrid]:
         raise ValueError(
             f"{path} holds no weights of waffleiron-s ({first_line(error)}): give the "
             "waffleiron_s.safetensors that a training with PointPretraining wrote, or leave "
-            "weights out for the file that comes with the package"
+            "weights out to use the file shipped with the package"
         ) from error
     return state, network, grid
 

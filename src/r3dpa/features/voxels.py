@@ -106,7 +106,7 @@ class PointCloudBatch(NamedTuple):
 
 
 def prepare_scan(points: np.ndarray | Tensor, grid: ScanGrid | None = None) -> PreparedScan:
-    """Thinned, cropped and indexed scan.
+    """Thin, crop and index a scan.
 
     Each voxel keeps its point of lowest index; voxels are counted from the lowest x, y, z of the
     scan and sorted by (x, y, z). Of these points, those within the field of view are kept. The
@@ -189,12 +189,12 @@ class MaskedScan(NamedTuple):
 
 @dataclass(frozen=True)
 class Masking:
-    """Rotates scans about z and mirrors them at random, hides blocks of rays, describes all points.
+    """Random rotation about z, mirroring and hidden blocks of rays, with descriptors as targets.
 
     Args:
         grid: Preparation of scans.
-        max_hidden: Upper limit, below 1, of the share of hidden blocks, which is drawn for each
-            scan from 0 on, so that training includes whole scans.
+        max_hidden: Upper limit, below 1, of the share of hidden blocks. The share is uniform from
+            0 for each scan, so that training includes whole scans.
     """
 
     grid: ScanGrid = field(default_factory=ScanGrid)

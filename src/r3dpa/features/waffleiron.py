@@ -24,7 +24,7 @@ _BLOCK = 1024  # points
 
 
 class WaffleIron(nn.Module):
-    """Tokens of all points from their features, neighbours and cells.
+    """Network that computes a token for each point from its features, neighbours and cells.
 
     ``depth`` layers, each a spatial mixing on one plane (xy, xz, yz, xy, ...) and a channel mixing
     of each token. The default sizes are WI-48-768, the backbone of ScaLR.
@@ -78,9 +78,8 @@ class WaffleIron(nn.Module):
         for cells, (rows, columns) in zip(batch.cells, self.plane_sizes, strict=True):
             index = cells + scan * (rows * columns)
             count = batch.features.new_zeros(num_scans * rows * columns)
-            count.index_add_(
-                0, index, count.new_ones(num_points) if weight is None else weight[:, 0]
-            )
+            ones = count.new_ones(num_points)
+            count.index_add_(0, index, ones if weight is None else weight[:, 0])
             share = (count + _COUNT_EPS).reciprocal()[:, None]
             planes.append(Plane(index, share, (num_scans, rows, columns), weight))
         return planes
@@ -120,7 +119,7 @@ class Embedding(nn.Module):
             others = features.index_select(0, neighbors.flatten())
             offsets = others - features.repeat_interleave(neighbors.shape[1], dim=0)
             around = self._around(offsets).unflatten(0, neighbors.shape).amax(dim=1)
-        else:  # one after the other in blocks that fit the caches: a K-th of the memory
+        else:  # one neighbour at a time, in blocks that fit the caches: 1 / K of the memory
             around = torch.cat(
                 [
                     reduce(torch.maximum, (self._around(features[i] - values) for i in others.T))

@@ -100,9 +100,9 @@ def scan_page(
         title: Shown on top.
         semantics: Categories of the labels by number; other numbers are shown as such.
         origins: Categories of the origins by number, likewise.
-        beside: Scan beside each scan, or one that stays beside all, seen by the same camera.
-        sensor: Gives the limits of the range colours; the default sensor if None.
-        gallery: Tiles by heading, shown in a column beside the cloud; none if None.
+        beside: Scan to show beside each scan, or one for all, seen by the same camera.
+        sensor: Gives the limits of the range colours; default: the default sensor.
+        gallery: Tiles by heading, shown in a column beside the cloud; default: no column.
         about: Lines on top of that column.
         mode: Colours at first: ``height``, ``range``, ``intensity``, ``semantic`` or ``origin``.
 

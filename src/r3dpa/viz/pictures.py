@@ -124,9 +124,12 @@ def scene_3d(
 
 
 def save(picture: Figure | Pixels, path: str | Path) -> Path:
-    """Writes a figure, or pixels ``(rows, columns[, 3])``, atomically; returns ``path``.
+    """Write a figure, or pixels ``(rows, columns[, 3])``, atomically; return ``path``.
 
-    The suffix names the format; another than the known ones raises a ``ValueError``.
+    The suffix names the format.
+
+    Raises:
+        ValueError: If the format is unknown.
     """
     with atomic_path(path := Path(path)) as temporary:
         if isinstance(picture, Figure):
