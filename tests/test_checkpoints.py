@@ -471,7 +471,7 @@ class TestTransfer:
             "latent_norm": NetworkState.of(LatentNorm(4), {"channels": 4}),
         }
         source = Checkpoint(Path("unet.ckpt"), "flow_matching", networks)
-        with pytest.raises(ValueError, match=r"unet\.ckpt holds a UNet, but .* of a SiT"):
+        with pytest.raises(ValueError, match=r"unet\.ckpt holds a UNet, but .* to a SiT"):
             transfer_rgb(source, SiT(**SIT_ARGS), LatentNorm(4), keep_projector=False)
 
 
