@@ -159,7 +159,8 @@ def simulate(
         write(out / _CLASSES, classes.encode())
         tasks = []
         for drive, count in files.items():
-            missing, simulator = drive.missing(count), simulators[drive.drive]
+            missing = drive.missing(count)
+            simulator = simulators[drive.drive]
             for start in range(0, len(missing), _SCANS_PER_TASK):
                 tasks.append((drive, simulator, missing[start : start + _SCANS_PER_TASK]))
         num_missing = sum(len(numbers) for *_, numbers in tasks)
@@ -230,7 +231,8 @@ def _check_folder(out: Path, request: dict[str, Any]) -> bool:
             )
         return False
     stored = _read_json(manifest)
-    num_stored, scans = stored.get("scans"), request["scans"]
+    num_stored = stored.get("scans")
+    scans = request["scans"]
     same_scans = stored | ({"scans": scans} if isinstance(num_stored, int) else {})
     if different := list(differences(same_scans, request)):
         raise ValueError(

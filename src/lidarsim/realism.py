@@ -292,7 +292,8 @@ def realism_table(
             for both in (pairs, real_pairs)
         )
         distance, floor = _over_finite(np.median, distances), _over_finite(np.median, floors)
-        real, ratio = whole_b[name], math.nan
+        real = whole_b[name]
+        ratio = math.nan
         lacks = {"A": measure.lacks, "B": real.lacks}
         reason = "; ".join(f"{side}: {why}" for side, why in lacks.items() if why)
         if math.isnan(distance):

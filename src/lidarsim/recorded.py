@@ -152,7 +152,8 @@ def _with_laser(
     sensor: str | SpinningLidar, returns: Returns, inclination_deg: int
 ) -> SpinningLidar:
     sensor = load_sensor(sensor) if isinstance(sensor, str) else sensor
-    highest, height_m = min(inclination_deg, _HIGHEST_DEG), float(np.mean(sensor.lasers.height_m))
+    highest = min(inclination_deg, _HIGHEST_DEG)
+    height_m = float(np.mean(sensor.lasers.height_m))
     laser = Lasers((np.radians(highest),), (0.0,), (height_m,), (0.0,), (0.0,), (1.0,))
     return replace(sensor, lasers=laser, range_step_m=0.0, return_mode=returns)
 

@@ -223,7 +223,8 @@ def damped_intensity(
     power: NDArray[np.float32], range_m: NDArray[np.float32], min_power: float
 ) -> NDArray[np.float32]:
     """:func:`calibrated_intensity` before it is limited and rounded."""
-    weakest, strong = np.float32(_ZERO_INTENSITY * min_power), _FULL_INTENSITY / _ZERO_INTENSITY
+    weakest = np.float32(_ZERO_INTENSITY * min_power)
+    strong = _FULL_INTENSITY / _ZERO_INTENSITY
     ramp = np.log(np.maximum(power, weakest) / weakest) / np.float32(np.log(strong))
     return np.sqrt(power * range_m**2) * ramp.clip(max=1)
 
@@ -237,7 +238,8 @@ def power_of_intensity(
 
         power = a exp(2 W(c / 2))        c = L intensity / (range sqrt(a))
     """
-    weakest, ramp = _ZERO_INTENSITY * min_power, np.log(_FULL_INTENSITY / _ZERO_INTENSITY)
+    weakest = _ZERO_INTENSITY * min_power
+    ramp = np.log(_FULL_INTENSITY / _ZERO_INTENSITY)
     root = intensity / range_m / np.float32(np.sqrt(weakest))  # of power / a, undamped
     exponent = 2 * np.log(np.maximum(root, np.finfo(np.float32).tiny))
     damped = np.flatnonzero(exponent < ramp)

@@ -109,7 +109,8 @@ class ScanStatistics:
 
     def count(self, name: str, *columns: NDArray[Any], weight: NDArray[Any] | None = None) -> None:
         """Add rows to a table; its columns are indices, or values of a binned axis."""
-        table, index = getattr(self, name), []
+        table = getattr(self, name)
+        index = []
         for axis, column in zip(_AXES[name], columns, strict=True):
             index.append(axis.of(column) if isinstance(axis, Bins) else column.astype(np.int64))
         flat = np.ravel_multi_index(tuple(index), table.shape)
@@ -236,7 +237,8 @@ def _count_beams(
     ground: Mask,
     upright: structure.Upright,
 ) -> None:
-    s.num_beam_scans, s.shots = 1, 2 * math.pi / sweep.shot_rad
+    s.num_beam_scans = 1
+    s.shots = 2 * math.pi / sweep.shot_rad
     ring, residual_m, step_m = sweep.ring, np.abs(upright.residual_m), upright.step_m
     small, level = residual_m < _MAX_RESIDUAL_M, np.abs(step_m) < _MAX_RESIDUAL_M
     s.count("beam_returns", ring)

@@ -246,7 +246,8 @@ class Sweep:
         """Whether nothing stands in a direction ``(3,)`` in the middle of the sweep."""
         nothing = np.full(1, NO_SURFACE, dtype=np.int32)
         here, towards = self.start.mean(axis=1, keepdims=True), direction[:, None]
-        now, reach_m = np.zeros(1, dtype=np.float32), np.full(1, 1e3)
+        now = np.zeros(1, dtype=np.float32)
+        reach_m = np.full(1, 1e3)
         _, surface = cast_single(self.solids, here, towards, now, reach_m, nothing, nothing)
         return bool(surface[0] == NO_SURFACE)
 

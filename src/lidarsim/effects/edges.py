@@ -218,7 +218,8 @@ def _peaks(targets: _Targets, met: Indices, range_m: Floats, merge_m: float) -> 
     with np.errstate(invalid="ignore"):
         apart = np.diff(range_m, axis=0) >= merge_m
     peak_of = np.vstack([np.zeros_like(apart[:1]), apart]).cumsum(axis=0)
-    columns, num_rays = np.arange(met.shape[1]), met.shape[1]
+    columns = np.arange(met.shape[1])
+    num_rays = met.shape[1]
     none = np.zeros(num_rays, dtype=np.float32)
     first = second = _Peak(none + np.inf, none, np.full(num_rays, -1), none > 0)
     for number in range(peak_of.max(initial=-1) + 1):
@@ -369,7 +370,8 @@ def _seen_from(sweep: Sweep, rays: Indices, solid: Indices) -> tuple[Floats, Flo
     """Distances of the centres of solids ahead of rays and to their left, seen from above."""
     x, y = sweep.solids.centre[solid, :2].T - sweep.start[:2, rays]
     if sweep.actor_time_s is not None:
-        velocity, time_s = sweep.solids.velocity[solid].T, sweep.actor_time_s[rays]
+        velocity = sweep.solids.velocity[solid].T
+        time_s = sweep.actor_time_s[rays]
         x, y = x + velocity[0] * time_s, y + velocity[1] * time_s
     along, across = sweep.direction[:2, rays]
     length = np.sqrt(along * along + across * across)

@@ -181,7 +181,8 @@ def _streams(seed: int, drive: int) -> tuple[_Stream, ...]:
         lateral = -(lane + 0.5) * course.lane_m
         streams.append(_Stream(vehicle, lateral, 1, speed_m_s, draw.uniform(*character.car_gap_m)))
     for lane in range(course.lanes[1]):
-        lateral, gap_m = (lane + 0.5) * course.lane_m, draw.uniform(*character.car_gap_m)
+        lateral = (lane + 0.5) * course.lane_m
+        gap_m = draw.uniform(*character.car_gap_m)
         streams.append(_Stream(vehicle, lateral, -1, draw.uniform(9, 15), gap_m))
     for side in (-1, 1):
         kerb = course.kerb(side)

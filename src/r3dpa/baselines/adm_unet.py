@@ -23,7 +23,8 @@ class ADMUNet(EfficientUNet):
     def _build(
         self, channels: int, widths: Sequence[int], counts: Sequence[int], shared: Shared
     ) -> None:
-        lowest, last = len(widths) - 1, widths[-1]
+        lowest = len(widths) - 1
+        last = widths[-1]
         self.in_conv = shared.conv(channels, widths[0])
         skips = [widths[0]]
         self.down_blocks, self.up_blocks = nn.ModuleList(), nn.ModuleList()

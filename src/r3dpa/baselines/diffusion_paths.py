@@ -122,7 +122,8 @@ class StepPath(DiffusionPath):
 
     def log_snr(self, time: Tensor) -> Tensor:
         """Log signal-to-noise ratio at times in [0, 1] of any shape."""
-        step, table = self.step_of(time), self.signal.logit().to(time.device)
+        step = self.step_of(time)
+        table = self.signal.logit().to(time.device)
         low = step.floor().long().clamp(max=self.num_steps - 2)
         return torch.lerp(table[low], table[low + 1], (step - low).double()).to(time.dtype)
 

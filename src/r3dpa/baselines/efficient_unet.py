@@ -318,7 +318,8 @@ def spherical_harmonics(angles: Tensor) -> Tensor:
 
     Orders of a degree run from -l to l. The y axis points to the right, as in the official code.
     """
-    sine, azimuth = angles[:, 0].double().sin(), -angles[:, 1].double()
+    sine = angles[:, 0].double().sin()
+    azimuth = -angles[:, 1].double()
     harmonics = []
     for degree in range(5):
         for order in range(-degree, degree + 1):

@@ -120,7 +120,9 @@ class BaselineGenerator:
         :func:`~r3dpa.baselines.diffusion_paths.repaint`, with the steps of the sampler. Latents
         are completed without resampling, see :func:`~r3dpa.baselines.diffusion_paths.inpaint`.
         """
-        self.calls, baseline, indices = 0, self.baseline, scene_indices(indices)
+        self.calls = 0
+        baseline = self.baseline
+        indices = scene_indices(indices)
         noises = scene_noise(baseline.latent_shape, indices, seed)
         draws = (noise.to(self.device) for noise in noises)
         data = baseline.encode(image.to(self.device)[None]).expand(len(indices), -1, -1, -1)

@@ -50,7 +50,8 @@ class Codebook(nn.Module):
     def forward(self, latents: Tensor) -> Quantised:
         """Nearest codes of ``(B, C, h, w)``; gradients pass through as if nothing had changed."""
         latents = at_least_float32(latents)
-        codes, pixels = self.embedding.weight, latents.movedim(1, -1)
+        codes = self.embedding.weight
+        pixels = latents.movedim(1, -1)
         with no_autocast(latents.device):
             products = pixels @ codes.T
         distance = pixels.square().sum(-1, keepdim=True) + codes.square().sum(1) - 2 * products

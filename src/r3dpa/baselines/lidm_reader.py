@@ -61,7 +61,8 @@ def from_lidm(
         unet, average = weights["network"], weights["ema_network"]
         ours = {key.replace(".", ""): key for key in unet}
         weights["ema_network"] = {ours.get(key, key): value for key, value in average.items()}
-        sensor, stride = PROJECTION["sensor"], whole_stride(sizes["strides"])
+        sensor = PROJECTION["sensor"]
+        stride = whole_stride(sizes["strides"])
         size = [sensor["beams"] // stride[0], sensor["columns"] // stride[1]]
         arguments = unet_sizes(unet) | {"input_size": size, "position_bias": "ape.bias" in unet}
         for name in ("network", "ema_network"):

@@ -66,7 +66,8 @@ def _attend_without_dilation(
     query: Tensor, key: Tensor, value: Tensor, kernel: Size, wrap: bool
 ) -> Tensor:
     height, width = query.shape[1:3]
-    device, block = query.device, min(_BLOCK, query.shape[2])
+    device = query.device
+    block = min(_BLOCK, query.shape[2])
     rows = _starts(torch.arange(height, device=device), kernel[0], height)
     rows = rows[:, None] + torch.arange(kernel[0], device=device)
 

@@ -181,7 +181,8 @@ class SceneScorer(L.Callback):
         generator = module.scene_generator(self.sampler, self.precision)
         batches = range(0, self.num_scenes, self.batch_size)
         batches = batches[trainer.global_rank :: trainer.world_size]
-        quiet, nfe = None if trainer.is_global_zero else True, 0
+        quiet = None if trainer.is_global_zero else True
+        nfe = 0
         for first in tqdm(batches, "sampling", unit="batch", disable=quiet):
             indices = range(first, min(first + self.batch_size, self.num_scenes))
             scenes = generator.generate(indices, self.seed)

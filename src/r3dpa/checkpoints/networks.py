@@ -135,7 +135,8 @@ class NetworkState:
         Raises:
             ValueError: If the class refuses the arguments.
         """
-        kind, arguments = self.kind, {key: _tuples(value) for key, value in self.init_args.items()}
+        kind = self.kind
+        arguments = {key: _tuples(value) for key, value in self.init_args.items()}
         try:
             return kind(**arguments)
         except UNPICKLING_ERRORS as error:

@@ -102,7 +102,8 @@ def with_further_channels(checkpoint: Checkpoint, vae: VAE) -> Checkpoint:
     wider = replace(
         state, init_args={**state.init_args, **channels}, state_dict={**state.state_dict, **layers}
     )
-    networks, geometry = {**checkpoint.networks, "vae": wider}, checkpoint.geometry
+    networks = {**checkpoint.networks, "vae": wider}
+    geometry = checkpoint.geometry
     if geometry is not None:
         channels = {"intensity_channel": vae.intensity, "num_classes": vae.num_classes}
         geometry = {**geometry, "codec": {**geometry["codec"], **channels}}
@@ -201,7 +202,8 @@ def read_snapshot(
     scale = ratios.log().mean().exp()
     spread = (ratios / scale - 1).abs().max().item()
     shift = ((strong_norm.running_mean - norm.running_mean).double() / deviation).float()
-    reason, vae = "", _vae_note(weak)
+    reason = ""
+    vae = _vae_note(weak)
     if vae is None or vae != _vae_note(strong):
         reason = "its latents come from another VAE, as within stage joint"
     elif spread > NORM_TOLERANCE:
