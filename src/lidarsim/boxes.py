@@ -71,5 +71,5 @@ def _line(parts: list[Primitive], sensor_to_world: NDArray[np.float64]) -> str:
 
 
 def _wrap_angle(angle_rad: float) -> float:
-    """The same angle in [-pi, pi]."""
+    """Return the angle wrapped to [-pi, pi]."""
     return math.remainder(angle_rad, 2 * math.pi)

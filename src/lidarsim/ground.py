@@ -23,7 +23,7 @@ Plane = NDArray[np.float64]  # slopes along x and y, and height at the origin
 
 
 def ground_of(points: NDArray[np.float32]) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
-    """Which points are ground ``(P,)``, and the upright normal ``(P, 3)`` of their sector's plane.
+    """Mask ``(P,)`` of the ground, and the upright normal ``(P, 3)`` of each point's sector plane.
 
     Planes are fitted by least squares to the lowest points of cells, then again and again to the
     points ever nearer to the plane. A sector takes the plane of the whole scan where its own is

@@ -212,7 +212,7 @@ def _inside_medium(distance: Floats, drawn: Floats, extinction: Floats) -> Float
 def _meets_slat(
     solids: Solids, index: NDArray[np.integer] | int, solid: _Solid, at: Floats
 ) -> NDArray[np.bool_]:
-    """Whether points ``(3, M)`` on solids lie on one of their slats; those without have one."""
+    """Whether points ``(3, M)`` on solids lie on a slat; always, for solids without slats."""
     across, _, up = _unit_frame(solid, at, True)
     pitch_m, share, lowest_m, highest_m = np.moveaxis(solids.slats[index], -1, 0)
     half_size = solids.half_size[index]

@@ -113,7 +113,7 @@ def angles(points: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np
 
 @dataclass(frozen=True)
 class Instrument:
-    """What is assumed of the instrument that recorded a scan.
+    """Assumed properties of the instrument that recorded a scan.
 
     Args:
         sensor: Its detection limit, beam, pulse and noise: ``hdl64e``, ``hdl32e``, ``vls128``, a

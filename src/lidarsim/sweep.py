@@ -218,7 +218,7 @@ class Sweep:
         return np.flatnonzero(IS_GROUND[self.material] & (self.first.surface >= GROUND))
 
     def on_sheets(self) -> NDArray[np.bool_]:
-        """Which rays ``(R,)`` now have an echo of retro-reflecting sheeting."""
+        """Mask of the rays ``(R,)`` whose echo comes from retro-reflecting sheeting."""
         is_sheet = [p.material is Material.RETROREFLECTOR for p in self.scene.primitives]
         return self.of_surface(is_sheet, 0, bool)
 

@@ -43,7 +43,7 @@ class Job(NamedTuple):
 
     @property
     def done(self) -> bool:
-        """Whether it ended well with these settings."""
+        """Whether the job has succeeded with these settings."""
         mark = self.place.with_suffix(".done")
         has_result = self.makes is None or self.makes.is_file()
         return has_result and mark.is_file() and mark.read_text(encoding="utf-8") == self.content

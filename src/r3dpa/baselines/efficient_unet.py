@@ -288,7 +288,7 @@ def corner_angles(projection: Projection) -> Tensor:
 
 
 def hdl64e_angles(size: Size) -> Tensor:
-    """The same of the sensor that R2DM assumes, for images ``(H, W)``."""
+    """Corner angles of the HDL-64E as R2DM assumes it, for images ``(H, W)``."""
     return corner_angles(SphericalProjection(LidarSensor(*size)))
 
 

@@ -61,7 +61,7 @@ class BaselineGenerator:
         return next(self.network.parameters()).device
 
     def with_sampler(self, sampler: SamplerConfig) -> BaselineGenerator:
-        """The same network with another solver; both may be used."""
+        """Return a generator of the same network with another solver."""
         other = copy.copy(self)
         other.sampler = sampler
         return other

@@ -91,7 +91,10 @@ class StepGuard(L.Callback):
             )
 
     def _find_faults(self, norms: Tensor) -> list[int]:
-        """Whether losses here, losses, gradients, buffers anywhere are bad; stop signal; idle."""
+        """Return flags of non-finite values, the stop signal, and whether all gradients are 0.
+
+        In order: losses of this process; losses, gradients and buffers of any process.
+        """
         losses = [values["loss"].to(norms) for _, _, values in self._batches if values]
         bad_losses = ~torch.stack([norms.new_zeros(()), *losses]).isfinite().all()
         moved = [b for b, _ in self._buffers if b.numel() and b.is_floating_point()]

@@ -178,7 +178,7 @@ class NetworkState:
                 )
 
     def problems(self, network: nn.Module) -> list[str]:
-        """All keys and shapes that differ between ``network`` and these weights."""
+        """List the keys and shapes that differ between ``network`` and these weights."""
         wanted, given = shapes_of(network.state_dict()), shapes_of(self.state_dict)
         differ = [key for key in wanted if key in given and wanted[key] != given[key]]
         return [

@@ -51,7 +51,7 @@ class ScanView(NamedTuple):
 
     @property
     def pixels(self) -> Pixels:
-        """What the model is given."""
+        """Input of the model."""
         return Pixels(self.range_m, self.intensity, self.classes)
 
 

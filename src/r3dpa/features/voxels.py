@@ -101,7 +101,7 @@ class PointCloudBatch(NamedTuple):
     num_points: Tensor  #: ``(B,)`` int64 points of each scan; their sum is N
 
     def to(self, device: torch.device | str) -> Self:
-        """The same batch on another device."""
+        """Return the batch on another device."""
         return type(self)(*(values.to(device, non_blocking=True) for values in self))
 
 

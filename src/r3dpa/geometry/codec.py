@@ -126,8 +126,8 @@ class RangeCodec:
             raise ValueError(
                 f"codec.num_classes must be {NUM_CLASSES}, or 0 for none, got {self.num_classes}"
             )
-        # So that a codec equals the same one written out. Not the number in place of None: the
-        # scale of a default codec would stay when a YAML file names another encoding alone.
+        # Store a default scale as None: equal codecs compare equal, and a YAML that changes only
+        # `encoding` gets the default scale of that encoding.
         if self.scale == _DEFAULT_SCALES[self.encoding]:
             object.__setattr__(self, "scale", None)
         if not 0.0 < self._divisor < math.inf:

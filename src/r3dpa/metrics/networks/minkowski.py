@@ -256,7 +256,7 @@ class SPVCNN(MinkowskiNet):
         )
 
     def forward(self, coordinates: Tensor, features: Tensor) -> Tensor:
-        """As of :class:`MinkowskiNet`, but rows of one voxel are averaged."""
+        """Run as :class:`MinkowskiNet` does, but average the rows of one voxel."""
         points = self._points(coordinates)
         voxels, _ = Voxels.from_coordinates(points.voxel_of(1))
         stem = self._stem(to_voxels(features, points, voxels), voxels)
