@@ -21,7 +21,7 @@ BANNED = {
     r"there (is|are) no [^.;:]+; there (is|are)": "unknown class 'x'; choose from a, b, c",
     r"(?<![a-z])(asked|told)(?![a-z])": "what happens: requested, required, predicted, reported",
     rf"(\b(one|two|three|four|five|\d)|\b({UNIT})) a ({WHOLE})\b": "per: '131 kB per scan'",
-    r"\ba (scan|scene) and core\b": "per scan and core",
+    r"\b(core|time|steps|turns) a (scan|scene|stage|second)\b|\ba scan and core\b": "per",
     r"\bnone for none\b": "'None for no split', or 'default: no split'",
     r"\b(per|every|each|what) (this|so|that) many\b": "'every n-th scan', or the unit",
     r"(?<=\. )(trained|known|kept|written|given) are\b": "a subject: 'Trains the VAE, ...'",
