@@ -92,10 +92,9 @@ def test_errors_begin_in_lower_case_and_end_without_a_period():
                 continue
             for message in node.exc.args[:1]:
                 parts = message.values if isinstance(message, ast.JoinedStr) else [message]
-                first, last = (
-                    part.value if isinstance(part, ast.Constant) else ""
-                    for part in (parts[0], parts[-1])
-                )
+                words = [str(part.value) for part in parts if isinstance(part, ast.Constant)]
+                first = words[0] if isinstance(parts[0], ast.Constant) else ""
+                last = words[-1] if isinstance(parts[-1], ast.Constant) else ""
                 # Names of classes, as RePaint, and abbreviations may begin a message.
                 if re.match(r"[A-Z][a-z]*\b", first) or last.endswith("."):
                     hits.append(f"{path.relative_to(ROOT)}:{node.lineno}: {first}...{last}")
