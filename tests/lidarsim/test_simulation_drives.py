@@ -328,7 +328,7 @@ def test_split_of_chosen_drives():
         ({"seed": -1}, "seed must be 0 or greater, got -1"),
         ({"sensor": "lidar"}, "no sensor 'lidar'"),
         ({"drives": ["3"]}, "got 3"),
-        ({"effects": {"fogg": "off"}}, r"no effect 'fogg'; there are dual_return, "),
+        ({"effects": {"fogg": "off"}}, r"unknown effect 'fogg'; choose from dual_return, "),
         ({"effects": {"range_noise": "of"}}, "range_noise must be auto, on or off, got 'of'"),
     ],
 )
