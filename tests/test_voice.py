@@ -41,7 +41,8 @@ def texts() -> Iterator[tuple[Path, str]]:
         for folder in ("src", "conf"):
             for path in sorted((ROOT / folder).rglob(f"*{suffix}")):
                 yield path, path.read_text()
-    yield ROOT / "README.md", (ROOT / "README.md").read_text()
+    for path in (*sorted(ROOT.glob("*.md")), *sorted((ROOT / "notebooks").glob("*.md"))):
+        yield path, path.read_text()
     for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
         cells = json.loads(path.read_text())["cells"]
         yield path, "\n\n".join("".join(cell["source"]) for cell in cells)
