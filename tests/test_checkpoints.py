@@ -279,13 +279,13 @@ class TestOfficial:
         del official["args"]
         with pytest.raises(ValueError, match=r"\['alignment_depth', 'input_size', 'num_heads'\]"):
             from_official(official, Path("a.pt"))
-        with pytest.raises(ValueError, match="not those of an official network"):
+        with pytest.raises(ValueError, match="do not belong to an official network"):
             from_official({**official, "model": {"conv.weight": torch.zeros(1)}}, Path("a.pt"))
 
     def test_an_image_vae_is_left_out_by_name(self, official):
         official["vae"] = {"encoder.conv_in.weight": torch.zeros(8, 3, 3, 3)}
         read = from_official(official, Path("rgb.pt"), sit_args=OFFICIAL_SIT_ARGS)
-        with pytest.raises(ValueError, match=r"no vae \(that of the file is not for range images"):
+        with pytest.raises(ValueError, match=r"no vae \(the file's VAE is not for range images"):
             read.network("vae")
 
     def test_options_beside_the_file(self, official, tmp_path):
@@ -471,7 +471,7 @@ class TestTransfer:
             "latent_norm": NetworkState.of(LatentNorm(4), {"channels": 4}),
         }
         source = Checkpoint(Path("unet.ckpt"), "flow_matching", networks)
-        with pytest.raises(ValueError, match=r"unet\.ckpt holds a UNet, but .* of a SiT"):
+        with pytest.raises(ValueError, match=r"unet\.ckpt holds a UNet, but .* to a SiT"):
             transfer_rgb(source, SiT(**SIT_ARGS), LatentNorm(4), keep_projector=False)
 
 

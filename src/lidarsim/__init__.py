@@ -1,6 +1,6 @@
 """Spinning LiDAR without torch: streets, ray casting, effects, weather, faults, files, realism.
 
-Simulated scans need NumPy and SciPy alone. :class:`Weather` is that of simulated streets and of
+Simulated scans need NumPy and SciPy alone. :class:`Weather` serves simulated streets and
 recorded scans.
 """
 

@@ -33,7 +33,7 @@ def kitti_label(scan: SimulatedScan, sensor_to_world: NDArray[np.float64]) -> st
 
         type truncated occluded alpha  bbox (4)  height width length  x y z  rotation_y
 
-    The frame is that of a camera at the sensor that looks ahead: x right, y down, z forward. The
+    The frame belongs to a camera at the sensor that looks ahead: x right, y down, z forward. The
     place is the middle of the lower face, in the middle of the sweep. There is no picture: the
     occlusion is 3 (unknown) and the picture's box -1.
 
@@ -63,13 +63,13 @@ def _line(parts: list[Primitive], sensor_to_world: NDArray[np.float64]) -> str:
     rotation, place = sensor_to_world[:, :3], sensor_to_world[:, 3]
     x, y, z = (bottom - place) @ rotation
     ahead = turn[:, 0] @ rotation  # of the object, in the sensor frame
-    rotation_y = _wrapped(-math.atan2(ahead[1], ahead[0]) - math.pi / 2)
-    alpha = _wrapped(rotation_y - math.atan2(-y, x))
+    rotation_y = _wrap_angle(-math.atan2(ahead[1], ahead[0]) - math.pi / 2)
+    alpha = _wrap_angle(rotation_y - math.atan2(-y, x))
     numbers = (height, width, length, -y, -z, x, rotation_y)
     kind = KITTI_TYPES[parts[0].semantic]
     return f"{kind} 0.00 3 {alpha:.2f} -1 -1 -1 -1 {' '.join(f'{v:.2f}' for v in numbers)}"
 
 
-def _wrapped(angle_rad: float) -> float:
-    """The same angle in [-pi, pi]."""
+def _wrap_angle(angle_rad: float) -> float:
+    """Return the angle wrapped to [-pi, pi]."""
     return math.remainder(angle_rad, 2 * math.pi)

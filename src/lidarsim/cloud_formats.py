@@ -31,7 +31,7 @@ _ADVICE = (
 # Share of the points whose intensity may be odd: single returns exceed the full scale of a sensor.
 ODD_SHARE = 1 / 1000
 _MOST_BEAMS, _MOST_COLUMNS = 256, 4096
-_MOST_RATIO = 100  # of the size of data to that of its file; LZF reaches 88
+_MOST_RATIO = 100  # size of data over size of its file; LZF reaches 88
 _OTHER_WIDTHS = (5, 6, 7, 8, 10, 12)
 # Rows whose parts are compared, see ``_are_parts``: a multiple of 2 and 3.
 _COMPARED_ROWS, _FEWEST_ROWS = 4080, 192
@@ -114,7 +114,7 @@ def _with_names(path: Path, rows: NDArray, columns: tuple[str, ...]) -> Table:
 
 
 def _can_be_rows(rows: NDArray) -> bool:
-    """Return whether columns ``(P, C)`` can be those of :data:`ROWS`; NaN is for a later check."""
+    """Return whether columns ``(P, C)`` can be :data:`ROWS`; NaN is for a later check."""
     intensity, ring = rows[:, 3:4], rows[:, 4:]
     if np.count_nonzero(intensity < 0) > ODD_SHARE * len(rows):
         return False

@@ -3,14 +3,14 @@
 ::
 
     data_3d_raw/2013_05_28_drive_XXXX_sync/velodyne_points/
-        timestamps.txt                  one line a scan, 10 Hz
+        timestamps.txt                  one line per scan, 10 Hz
         data/%010d.bin                  (P, 4) float32 x, y, z, intensity
         labels/%010d.label              (P,) uint32 semantic | instance << 16
         origins/%010d.origin            (P,) uint8 origin of each point, see ``Origin``
         sim/%010d.json                  summary of the scene and of each effect
         boxes/%010d.txt                 3-D boxes of vehicles and people, see ``kitti_label``
     data_poses/2013_05_28_drive_XXXX_sync/
-        velodyne_to_world.txt           one line a scan: number, then (3, 4) row by row
+        velodyne_to_world.txt           one line per scan: number, then (3, 4) row by row
 
 KITTI-360's own ``poses.txt``, of the same format, holds poses of its inertial unit, which is not
 simulated; hence the other name. Every file depends on the request only.

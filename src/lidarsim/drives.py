@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from lidarsim.drive_files import DriveFiles, drive_name, to_json, weather_to_dict, write
-from lidarsim.io import differences, in_processes, only_writer, text_table
+from lidarsim.io import differences, in_processes, json_values, only_writer, text_table
 from lidarsim.scan import Simulator, check_switches
 from lidarsim.scene import Conditions, Semantic
 from lidarsim.sensors.spinning import SpinningLidar, load_sensor
@@ -113,8 +113,8 @@ def simulate(
             reads, for an HDL-64E; in Python any instrument.
         return_mode: Strongest return of each shot, or the two strongest; default: as the sensor.
         effects: ``off`` or ``auto`` by effect, such as ``--effects.fog off``; default: ``auto``.
-        weather: Of all scans, such as ``--weather.rain_mm_h 10``; default: drawn for each stretch
-            of street.
+        weather: Weather of all scans, such as ``--weather.rain_mm_h 10``; default: drawn for each
+            stretch of street.
 
     Returns:
         Contents of the data set by effect, also written to ``report.json``.
@@ -138,7 +138,7 @@ def simulate(
         "seed": seed,
         "scans": scans,
         "drives": list(names),
-        "sensor": json.loads(json.dumps(asdict(sensor))),  # lists instead of tuples
+        "sensor": json_values(asdict(sensor)),
         "effects": check_switches(effects or {}),
         "weather": None if weather is None else weather_to_dict(weather),
     }
@@ -155,11 +155,12 @@ def simulate(
         holds_more = _check_folder(out, request)
         if not holds_more:
             write(out / _MANIFEST, to_json(request))
-        classes = "".join(f"{int(one)}: {one.name.lower()}\n" for one in Semantic)
+        classes = "".join(f"{int(semantic)}: {semantic.name.lower()}\n" for semantic in Semantic)
         write(out / _CLASSES, classes.encode())
         tasks = []
         for drive, count in files.items():
-            missing, simulator = drive.missing(count), simulators[drive.drive]
+            missing = drive.missing(count)
+            simulator = simulators[drive.drive]
             for start in range(0, len(missing), _SCANS_PER_TASK):
                 tasks.append((drive, simulator, missing[start : start + _SCANS_PER_TASK]))
         num_missing = sum(len(numbers) for *_, numbers in tasks)
@@ -168,7 +169,7 @@ def simulate(
         with tqdm(total=scans, initial=complete, unit="scan", desc="simulate", disable=None) as bar:
             for num_written in in_processes(_run, tasks, workers):
                 bar.update(num_written)
-        if holds_more:  # whose poses and report are those of all scans
+        if holds_more:  # whose poses and report cover all scans
             return _report_of(files, num_missing)
         return _finish(out, files, num_missing)
 
@@ -218,7 +219,7 @@ def _share(scans: int, drives: list[str]) -> dict[str, int]:
 
 
 def _check_folder(out: Path, request: dict[str, Any]) -> bool:
-    """Refuse a folder that holds anything but this data set; whether it is one of more scans."""
+    """Refuse a folder with other data; return whether it holds more scans of this data set."""
     manifest = out / _MANIFEST
     if out.exists() and not out.is_dir():
         raise ValueError(f"{out} is a file; give the folder of the data set")
@@ -230,7 +231,8 @@ def _check_folder(out: Path, request: dict[str, Any]) -> bool:
             )
         return False
     stored = _read_json(manifest)
-    num_stored, scans = stored.get("scans"), request["scans"]
+    num_stored = stored.get("scans")
+    scans = request["scans"]
     same_scans = stored | ({"scans": scans} if isinstance(num_stored, int) else {})
     if different := list(differences(same_scans, request)):
         raise ValueError(
@@ -275,7 +277,7 @@ def _finish(out: Path, files: Mapping[DriveFiles, int], num_written: int) -> Sim
 
 
 def _report_of(files: Mapping[DriveFiles, int], num_written: int) -> SimulationReport:
-    summaries = [one for drive, count in files.items() for one in drive.summaries(count)]
+    summaries = [summary for drive, count in files.items() for summary in drive.summaries(count)]
     return make_report(summaries, num_written)
 
 

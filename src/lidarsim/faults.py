@@ -100,7 +100,8 @@ class Fault:
 
     def _apply(self, scan: RecordedScan, seed: Seed) -> WeatheredScan:
         generator = generator_for(*(seed if isinstance(seed, tuple) else (seed,)), self.kind)
-        points, stays = scan.points, np.ones(len(scan), dtype=bool)
+        points = scan.points
+        stays = np.ones(len(scan), dtype=bool)
         labels = None if scan.labels is None else scan.labels.copy()
         if not self.amount:
             pass
@@ -124,11 +125,13 @@ class Fault:
             jitter = generator.normal(0, _JITTER, points.shape) + generator.normal(size=3)
             points = (points + self.amount * jitter).astype(np.float32)
         else:
-            axis, way = (one / np.linalg.norm(one) for one in generator.normal(size=(2, 3)))
+            vectors = generator.normal(size=(2, 3))
+            axis, way = (vector / np.linalg.norm(vector) for vector in vectors)
             turned = Rotation.from_rotvec(np.radians(self.amount) * axis).apply(points)
             points = (turned + _METRES_PER_DEGREE * self.amount * way).astype(np.float32)
         kept = np.flatnonzero(stays)
-        lost, moved = len(scan) - len(kept), int((points != scan.points).any(axis=1).sum())
+        lost = len(scan) - len(kept)
+        moved = int((points != scan.points).any(axis=1).sum())
         how = f"{self.amount:g} {STRENGTHS[self.kind][2]}"
         if self._halves_shots:
             how += ", and every second shot"
@@ -144,7 +147,8 @@ class Fault:
                 f"points are sure of one ({rings.num_rings} beams by {rings.how}): keep the order "
                 "of the sensor, or store the column ring"
             )
-        number, kept = np.arange(rings.num_rings), round((1 - self.amount) * rings.num_rings)
+        number = np.arange(rings.num_rings)
+        kept = round((1 - self.amount) * rings.num_rings)
         if self.kind == "missing_beams":
             return (generator.permutation(number) < kept)[rings.ring]
         chosen = (number + 1) * kept // rings.num_rings > number * kept // rings.num_rings
@@ -154,7 +158,8 @@ class Fault:
     def _echoes(self, scan: RecordedScan, generator: np.random.Generator) -> NDArray[np.bool_]:
         if scan.labels is None:
             raise ValueError("incomplete_echo acts on vehicles: it needs labels beside the scan")
-        classes, stays = scan.labels & 0xFFFF, np.ones(len(scan), dtype=bool)
+        classes = scan.labels & 0xFFFF
+        stays = np.ones(len(scan), dtype=bool)
         foreign = ((classes >= _SEMANTIC_KITTI) & (classes < ADDED_CLASS)).any()
         for number in _ITS_VEHICLES if foreign else _VEHICLES:
             points = np.flatnonzero(classes == number)

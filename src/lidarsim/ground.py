@@ -10,8 +10,8 @@ _SECTORS = 12
 _BORDERS_M = (12.0, 25.0)
 # The lowest points of cells of this length, by this quantile, start the fit.
 _CELL_M, _LOWEST = 2.0, 0.1
-# Distances from the plane of the points that the fits use, one after the other; the last is that
-# of the ground, to which the spread of far points is added.
+# Distances from the plane of the points that the fits use, one after the other. The last one
+# decides what is ground, plus the spread of far points.
 _WITHIN_M, _FAR_SHARE = (1.0, 0.5, 0.3, 0.2, 0.15), 0.003
 _LEAST_POINTS = 20
 _LEVEL_COS = 0.95  # steeper planes are no ground
@@ -23,11 +23,12 @@ Plane = NDArray[np.float64]  # slopes along x and y, and height at the origin
 
 
 def ground_of(points: NDArray[np.float32]) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
-    """Which points are ground ``(P,)``, and the upright normal ``(P, 3)`` of their sector's plane.
+    """Mask ``(P,)`` of the ground, and the upright normal ``(P, 3)`` of each point's sector plane.
 
     Planes are fitted by least squares to the lowest points of cells, then again and again to the
-    points ever nearer to the plane. A sector whose plane is steep, far from that of the whole scan
-    or of few points has that of the whole scan. The feet of walls, trees and cars are not ground.
+    points ever nearer to the plane. A sector takes the plane of the whole scan where its own is
+    steep, far from that plane or fitted to few points. The feet of walls, trees and cars are not
+    ground.
     """
     away_m = np.hypot(points[:, 0], points[:, 1])
     azimuth = np.arctan2(points[:, 1].astype(float), points[:, 0]) % (2 * np.pi)

@@ -37,7 +37,7 @@ UNPICKLING_ERRORS = (*_DAMAGED, *_BAD_VALUES, *_SYSTEM)
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """Temporary name beside ``path`` that becomes ``path`` when the block ends without an error.
+    """Yield a temporary name that becomes ``path`` when the block ends without an error.
 
     A reader sees the old file or the complete new one; the bytes are flushed before the renaming.
     Makes missing parent folders. ``OSError`` names ``path`` if it cannot be written.
@@ -84,7 +84,7 @@ def _fsync(path: Path) -> None:
 
 
 def no_follow(path: str, flags: int) -> int:
-    """``opener`` for :func:`open`: a symbolic link is an ``OSError``, not the file it leads to."""
+    """``opener`` for :func:`open` that raises ``OSError`` for a symbolic link."""
     return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0), 0o666)
 
 
@@ -151,8 +151,14 @@ def append(file: FileIO, data: bytes) -> None:
         raise
 
 
+def json_values(values: Any, default: Callable[[Any], Any] | None = None) -> Any:
+    """Return values as a JSON file holds them: lists for tuples, text for numbers as keys."""
+    text = json.dumps(values, default=default)
+    return json.loads(text)
+
+
 def differences(stored: Any, wanted: Any, name: str = "") -> Iterator[str]:
-    """Each value of a stored request that differs from the wanted one, as text."""
+    """Yield each value of a stored request that differs from the wanted one, as text."""
     if isinstance(stored, dict) and isinstance(wanted, dict):
         for key in stored | wanted:
             place = f"{name}.{key}" if name else key
@@ -205,7 +211,7 @@ def only_writer(lock: Path, what: str, wait: bool = False) -> Iterator[None]:
 
 
 def in_processes(function: Callable[[T], R], tasks: Sequence[T], workers: int) -> Iterator[R]:
-    """Results of a function, as they are ready and in any order; in this process if one is enough.
+    """Yield results of a function as they are ready, in any order; one worker is this process.
 
     Workers ignore interrupts and end when this process is killed. ``ChildProcessError`` if one of
     them was killed.

@@ -212,7 +212,7 @@ def _inside_medium(distance: Floats, drawn: Floats, extinction: Floats) -> Float
 def _meets_slat(
     solids: Solids, index: NDArray[np.integer] | int, solid: _Solid, at: Floats
 ) -> NDArray[np.bool_]:
-    """Whether points ``(3, M)`` on solids lie on one of their slats; those without have one."""
+    """Whether points ``(3, M)`` on solids lie on a slat; always, for solids without slats."""
     across, _, up = _unit_frame(solid, at, True)
     pitch_m, share, lowest_m, highest_m = np.moveaxis(solids.slats[index], -1, 0)
     half_size = solids.half_size[index]
@@ -233,9 +233,9 @@ def cast_single(
 ) -> tuple[Floats, NDArray[np.int32]]:
     """Nearest surface along M single rays that start anywhere, such as reflected ones.
 
-    Foliage counts as a surface, and the ground is only seen from above. A ray does not see the
-    solid, or ``GROUND``, in ``excluded``, and sees that in ``hollow`` from inside, such as the
-    house behind a window. Returns distance and solid ``(M,)`` as ``cast`` does.
+    Foliage counts as a surface, and the ground is only seen from above. A ray passes through the
+    solid, or ``GROUND``, in ``excluded``, and meets the solid in ``hollow`` from inside, such as
+    the house behind a window. Returns distance and solid ``(M,)`` as ``cast`` does.
     """
     nearest = max_range_m.astype(np.float32)
     surface = np.full(len(nearest), NO_SURFACE, dtype=np.int32)
@@ -314,7 +314,7 @@ def normals(
 
 
 def _draws_of(index: int, window: tuple[slice, slice], drawn: Floats) -> Floats:
-    """Draws of a window for one solid: those of the turn, shifted from solid to solid."""
+    """Draws of a window for one solid: the draws of the turn, shifted from solid to solid."""
     num_beams, num_shots = drawn.shape
     beams = np.arange(window[0].start, window[0].stop) + _BEAM_STRIDE * index
     shots = np.arange(window[1].start, window[1].stop) + _SHOT_STRIDE * index

@@ -62,11 +62,11 @@ class Measure(NamedTuple):
 def measures(s: ScanStatistics) -> dict[str, Measure]:
     """The 36 measures of a set of scans by name."""
     missing = {need: why for need, (count, why) in _NEEDS.items() if not getattr(s, count)}
-    found = {}
+    by_name = {}
     for measure in _measures(s):  # whose ``lacks`` are still names of ``_NEEDS``
         lacks = next((missing[need] for need in measure.lacks.split() if need in missing), "")
-        found[measure.name] = measure._replace(lacks=lacks)
-    return found
+        by_name[measure.name] = measure._replace(lacks=lacks)
+    return by_name
 
 
 def _measures(s: ScanStatistics) -> Iterator[Measure]:
@@ -96,13 +96,13 @@ def _measures(s: ScanStatistics) -> Iterator[Measure]:
     # variable, so that the few returns of grass and foliage that pass for smooth do not count more.
     noise_mm = _quantile(s.residual_counts, 0.5) * BINS["residual_counts"].width * 1000
     noise_mm /= _NORMAL_MEDIAN
-    median_mm = _known(np.median, noise_mm)
+    median_mm = _over_finite(np.median, noise_mm)
     yield Measure("range residual sd by beam", "mm", "beams", curve_rmse, noise_mm, median_mm)
-    # Median range of a beam minus that of both neighbouring beams.
+    # Median range of a beam minus the median range of both neighbouring beams.
     middle = BINS["step_counts"].number / 2
     bias_mm = (_quantile(s.step_counts, 0.5) - middle) * BINS["step_counts"].width * 1000
     yield Measure("range bias by beam", "mm", "beams", curve_rmse, bias_mm)
-    yield _number("spread of the beams' bias", "mm", "beams", _known(np.std, bias_mm))
+    yield _number("spread of the beams' bias", "mm", "beams", _over_finite(np.std, bias_mm))
 
     intensities = s.intensity_by_range.sum(axis=0)
     saturated = intensities[-2:].sum()  # 0.99 is the largest intensity in KITTI files
@@ -126,7 +126,7 @@ def _measures(s: ScanStatistics) -> Iterator[Measure]:
     yield _w1("ground reach by sector", "m", "ground", s, "ground_reach_counts")
     ring_m = _ratio(s.ground_distance_m, s.ground_returns, _MIN_COUNT)
     spacing_m = np.where(ring_m[:-1] < _NEAR_RINGS_M, -np.diff(ring_m), np.nan)
-    median_m = _known(np.median, spacing_m)
+    median_m = _over_finite(np.median, spacing_m)
     yield Measure("ground ring spacing", "m", "beams ground", curve_rmse, spacing_m, median_m)
 
     pairs, mixed, jumps = s.neighbours
@@ -206,7 +206,7 @@ def _quantile(histograms: Floats, quantile: float, at_least: float = _MIN_COUNT)
     return np.where(total >= at_least, index + _ratio(wanted - below, inside), np.nan)[..., 0]
 
 
-def _known(statistic: Callable[[Floats], Any], curve: Floats) -> float:
+def _over_finite(statistic: Callable[[Floats], Any], curve: Floats) -> float:
     finite = curve[np.isfinite(curve)]
     return float(statistic(finite)) if len(finite) else math.nan
 
@@ -286,14 +286,15 @@ def realism_table(
     pairs, real_pairs = [*product(of_scans, of_reference)], [*combinations(of_reference, 2)]
     whole_b = measures(b)
     rows = []
-    for name, own in measures(a).items():
+    for name, measure in measures(a).items():
         distances, floors = (
-            np.array([float(own.distance(x[name].values, y[name].values)) for x, y in both])
+            np.array([float(measure.distance(x[name].values, y[name].values)) for x, y in both])
             for both in (pairs, real_pairs)
         )
-        distance, floor = _known(np.median, distances), _known(np.median, floors)
-        real, ratio = whole_b[name], math.nan
-        lacks = {"A": own.lacks, "B": real.lacks}
+        distance, floor = _over_finite(np.median, distances), _over_finite(np.median, floors)
+        real = whole_b[name]
+        ratio = math.nan
+        lacks = {"A": measure.lacks, "B": real.lacks}
         reason = "; ".join(f"{side}: {why}" for side, why in lacks.items() if why)
         if math.isnan(distance):
             reason = reason or "no bin holds enough returns in a drive of A and in one of B"
@@ -307,13 +308,13 @@ def realism_table(
             ratio = distance / floor
         elif not reason:
             ratio = math.inf if distance else 0.0
-        values = float(own.summary), float(real.summary)
-        pooled = float(own.distance(own.values, real.values))
-        largest = _known(np.max, floors)
+        values = float(measure.summary), float(real.summary)
+        pooled = float(measure.distance(measure.values, real.values))
+        largest = _over_finite(np.max, floors)
         rows.append(
-            RealismRow(name, own.unit, *values, distance, floor, largest, pooled, ratio, reason)
+            RealismRow(name, measure.unit, *values, distance, floor, largest, pooled, ratio, reason)
         )
-    described = (_counted("A", scans, a), _counted("B", reference, b))
+    described = (_describe_drives("A", scans, a), _describe_drives("B", reference, b))
     return RealismTable(tuple(rows), (*described, *notes))
 
 
@@ -332,7 +333,9 @@ def _text(value: float) -> str:
     return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
 
 
-def _counted(name: str, drives: Mapping[str, ScanStatistics], pooled: ScanStatistics) -> str:
+def _describe_drives(
+    name: str, drives: Mapping[str, ScanStatistics], pooled: ScanStatistics
+) -> str:
     sizes = [statistics.num_scans for statistics in drives.values()]
     total = f"{name}: {_plural(pooled.num_scans, 'scan')} of {_plural(len(drives), 'drive')}"
     if len(sizes) > 1:

@@ -1,7 +1,7 @@
 """Recorded scans, and the turn of one on which the effects of the simulator can act.
 
-One ray per point, from the origin of the frame. Of shots without a return nothing is known, so
-that there are no rays for them: no effect gives them an echo.
+One ray per point, from the origin of the frame. Shots without a return are unknown and have no
+ray, so that no effect gives them an echo.
 """
 
 from __future__ import annotations
@@ -113,14 +113,14 @@ def angles(points: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np
 
 @dataclass(frozen=True)
 class Instrument:
-    """What is assumed of the instrument that recorded a scan.
+    """Assumed properties of the instrument that recorded a scan.
 
     Args:
         sensor: Its detection limit, beam, pulse and noise: ``hdl64e``, ``hdl32e``, ``vls128``, a
             calibration file or a :class:`SpinningLidar`; its lasers are not used.
         returns: Which echoes of a shot it reports.
-        full_intensity: Intensity of a white surface in front of it; None: by the 99.9 % quantile of
-            each scan: 1 up to 1 unless the intensities are integers, 255 up to 255, else itself.
+        full_intensity: Intensity of a white surface in front of it. Default: from the 99.9 %
+            quantile q of each scan: 1 if q <= 1 (not for integers), 255 if q <= 255, else q.
         response: ``root``: intensity is the root of the power, corrected for range and damped for
             weak echoes as in KITTI's scans; ``linear``: proportional to the power, corrected for
             range, as in calibrated reflectivities.
@@ -152,7 +152,8 @@ def _with_laser(
     sensor: str | SpinningLidar, returns: Returns, inclination_deg: int
 ) -> SpinningLidar:
     sensor = load_sensor(sensor) if isinstance(sensor, str) else sensor
-    highest, height_m = min(inclination_deg, _HIGHEST_DEG), float(np.mean(sensor.lasers.height_m))
+    highest = min(inclination_deg, _HIGHEST_DEG)
+    height_m = float(np.mean(sensor.lasers.height_m))
     laser = Lasers((np.radians(highest),), (0.0,), (height_m,), (0.0,), (0.0,), (1.0,))
     return replace(sensor, lasers=laser, range_step_m=0.0, return_mode=returns)
 
@@ -185,21 +186,21 @@ def scale_of(intensity: NDArray | None, full: float | None = None) -> IntensityS
     is_integer = intensity is not None and intensity.dtype.kind in "iu"
     largest = high if high <= 1 else float(np.quantile(values, 0.999))
     if largest <= 1 and not is_integer:
-        found, unit = 1.0, "0..1"
+        scale, unit = 1.0, "0..1"
     elif largest <= 255:
-        found, unit = 255.0, "0..255"
+        scale, unit = 255.0, "0..255"
     else:
-        found, unit = largest, "instrument units"
-    found = full or found
-    off_grid = {s: np.abs(values / s - np.round(values / s)).max() for s in (found / 100, 1.0)}
-    step = next((s for s, most in off_grid.items() if found > s and most < 1e-3), 0.0)
+        scale, unit = largest, "instrument units"
+    scale = full or scale
+    off_grid = {s: np.abs(values / s - np.round(values / s)).max() for s in (scale / 100, 1.0)}
+    step = next((s for s, most in off_grid.items() if scale > s and most < 1e-3), 0.0)
     steps = f" in steps of {step:g}" if step else ""
-    text = f"intensity {low:g}..{high:g}{steps}: {unit}, full scale {found:g}"
-    return IntensityScale(found, step, True, text)
+    text = f"intensity {low:g}..{high:g}{steps}: {unit}, full scale {scale:g}"
+    return IntensityScale(scale, step, True, text)
 
 
 def _shares(scan: RecordedScan, scale: IntensityScale) -> Floats:
-    """Intensities ``(P,)`` over that of a white surface, at most 1."""
+    """Intensities ``(P,)`` over the intensity of a white surface, at most 1."""
     if scan.intensity is None or not scale.known:
         return np.full(len(scan), _UNKNOWN_INTENSITY, dtype=np.float32)
     shares: Floats = (scan.intensity / scale.full).astype(np.float32).clip(max=1)

@@ -49,16 +49,16 @@ def rings_in_order(
     # Inclinations spread evenly over the field of view have a deviation of 0.29 times it.
     if spread > sensor.field_of_view_rad / 6:
         deviation_deg = math.degrees(spread)
-        found = f"inclinations within one turn have a deviation of {deviation_deg:.1f} degrees"
-        raise not_in_ring_order(found, sensor)
+        reason = f"inclinations within one turn have a deviation of {deviation_deg:.1f} degrees"
+        raise not_in_ring_order(reason, sensor)
     return ring, num_rings
 
 
-def not_in_ring_order(found: str, sensor: LidarSensor) -> ValueError:
+def not_in_ring_order(reason: str, sensor: LidarSensor) -> ValueError:
     """Error of a scan that is not stored ring after ring."""
     return ValueError(
         f"the scan is not stored ring after ring (highest first, each by growing azimuth from 0): "
-        f"{found}, for a sensor of {sensor.beams} beams; keep the order of the original file, or "
+        f"{reason}, for a sensor of {sensor.beams} beams; keep the order of the original file, or "
         "use SphericalProjection, which needs no order"
     )
 

@@ -63,7 +63,9 @@ def rings_of(scan: RecordedScan) -> Rings:
     if scan.ring is None:
         ring, how, sure = _in_order(inclination, azimuth) or _by_inclination(inclination)
     else:
-        ring, how, sure = np.unique(scan.ring, return_inverse=True)[1], "stored", 1.0
+        ring = np.unique(scan.ring, return_inverse=True)[1]
+        how = "stored"
+        sure = 1.0
     mean = np.bincount(ring, inclination) / np.bincount(ring)
     ring = np.argsort(np.argsort(-mean))[ring]
     order = np.lexsort((azimuth, ring))

@@ -72,7 +72,7 @@ def check_switches(switches: Mapping[str, str | bool]) -> dict[str, str]:
     names = [effect_name(effect) for effect in EFFECTS]
     for name, switch in switches.items():
         if name not in names:
-            raise ValueError(f"there is no effect {name!r}; there are {', '.join(names)}")
+            raise ValueError(f"unknown effect {name!r}; choose from {', '.join(names)}")
         if switch not in ("auto", "on", "off", True, False):
             raise ValueError(f"effect {name} must be auto, on or off, got {switch!r}")
     return {name: "off" for name in sorted(switches) if switches[name] in ("off", False)}
@@ -223,7 +223,8 @@ def damped_intensity(
     power: NDArray[np.float32], range_m: NDArray[np.float32], min_power: float
 ) -> NDArray[np.float32]:
     """:func:`calibrated_intensity` before it is limited and rounded."""
-    weakest, strong = np.float32(_ZERO_INTENSITY * min_power), _FULL_INTENSITY / _ZERO_INTENSITY
+    weakest = np.float32(_ZERO_INTENSITY * min_power)
+    strong = _FULL_INTENSITY / _ZERO_INTENSITY
     ramp = np.log(np.maximum(power, weakest) / weakest) / np.float32(np.log(strong))
     return np.sqrt(power * range_m**2) * ramp.clip(max=1)
 
@@ -237,7 +238,8 @@ def power_of_intensity(
 
         power = a exp(2 W(c / 2))        c = L intensity / (range sqrt(a))
     """
-    weakest, ramp = _ZERO_INTENSITY * min_power, np.log(_FULL_INTENSITY / _ZERO_INTENSITY)
+    weakest = _ZERO_INTENSITY * min_power
+    ramp = np.log(_FULL_INTENSITY / _ZERO_INTENSITY)
     root = intensity / range_m / np.float32(np.sqrt(weakest))  # of power / a, undamped
     exponent = 2 * np.log(np.maximum(root, np.finfo(np.float32).tiny))
     damped = np.flatnonzero(exponent < ramp)

@@ -53,7 +53,7 @@ def read_scan(
 
 
 def _refuse_bright(path: Path, intensity: np.ndarray) -> None:
-    """Refuse intensities of another full scale than 1; single returns exceed that of a sensor."""
+    """Refuse intensities of another full scale than 1; single returns may exceed full scale."""
     num_bright = np.count_nonzero(intensity > 1)
     if num_bright > ODD_SHARE * len(intensity):
         raise ScanError(

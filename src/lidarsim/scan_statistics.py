@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarsim import scan_structure as structure
-from lidarsim.scan_structure import GROUND_BAND_M, Floats, Ground, Indices, Mask, Sweep
+from lidarsim.scan_structure import GROUND_BAND_M, Floats, Ground, Indices, Mask, RingReturns
 from lidarsim.sensors.view import LidarSensor, hit_pixels
 
 
@@ -59,7 +59,7 @@ class ScanStatistics:
     """Counts over scans; ``a + b`` holds the counts of both. Arrays are float64.
 
     Returns are the points between 1 and 80 m, so dummies at the origin are not counted. "Ring
-    order" is that of KITTI files, beam after beam. Counts that a scan cannot give are zero.
+    order" is as in KITTI files, beam after beam. Counts that a scan cannot give are zero.
     Surfaces are (ground, upright).
     """
 
@@ -108,8 +108,9 @@ class ScanStatistics:
         return type(self)(*(getattr(self, name) + getattr(other, name) for name in names))
 
     def count(self, name: str, *columns: NDArray[Any], weight: NDArray[Any] | None = None) -> None:
-        """Adds rows of columns to a table; a column holds indices, or values of a binned axis."""
-        table, index = getattr(self, name), []
+        """Add rows to a table; its columns are indices, or values of a binned axis."""
+        table = getattr(self, name)
+        index = []
         for axis, column in zip(_AXES[name], columns, strict=True):
             index.append(axis.of(column) if isinstance(axis, Bins) else column.astype(np.int64))
         flat = np.ravel_multi_index(tuple(index), table.shape)
@@ -200,7 +201,9 @@ def _count_ground(s: ScanStatistics, xyz: Floats, ground: Ground) -> None:
     s.count("ground_reach_counts", reach)
 
 
-def _count_rings(s: ScanStatistics, range_m: Floats, sweep: Sweep, incidence_deg: Floats) -> None:
+def _count_rings(
+    s: ScanStatistics, range_m: Floats, sweep: RingReturns, incidence_deg: Floats
+) -> None:
     s.num_ring_scans = 1
     before, after, missing = sweep.neighbour(-1), sweep.neighbour(1), sweep.missing
     s.count("drop_runs", missing[missing > 0])
@@ -221,16 +224,21 @@ def _count_rings(s: ScanStatistics, range_m: Floats, sweep: Sweep, incidence_deg
     middle_m = (range_m[left] + range_m[right]) / 2
     angle_deg = (incidence_deg[:, left] + incidence_deg[:, right]) / 2
     surface, pair = np.isfinite(angle_deg).nonzero()
-    own: dict[str, Any] = {"weight": weight[pair]}
+    weights: dict[str, Any] = {"weight": weight[pair]}
     s.count("keep_by_range", middle_m, outcome, weight=weight)
-    s.count("surface_keep_by_range", surface, middle_m[pair], outcome[pair], **own)
-    s.count("keep_by_incidence", surface, angle_deg[surface, pair], outcome[pair], **own)
+    s.count("surface_keep_by_range", surface, middle_m[pair], outcome[pair], **weights)
+    s.count("keep_by_incidence", surface, angle_deg[surface, pair], outcome[pair], **weights)
 
 
 def _count_beams(
-    s: ScanStatistics, distance: Floats, sweep: Sweep, ground: Mask, upright: structure.Upright
+    s: ScanStatistics,
+    distance: Floats,
+    sweep: RingReturns,
+    ground: Mask,
+    upright: structure.Upright,
 ) -> None:
-    s.num_beam_scans, s.shots = 1, 2 * math.pi / sweep.shot_rad
+    s.num_beam_scans = 1
+    s.shots = 2 * math.pi / sweep.shot_rad
     ring, residual_m, step_m = sweep.ring, np.abs(upright.residual_m), upright.step_m
     small, level = residual_m < _MAX_RESIDUAL_M, np.abs(step_m) < _MAX_RESIDUAL_M
     s.count("beam_returns", ring)

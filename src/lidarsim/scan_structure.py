@@ -36,7 +36,7 @@ _MAX_STEP_DEG = 60.0
 _MAX_UPRIGHT_NORMAL_Z = 0.5  # normals less than 30 degrees from the horizon
 
 
-class Sweep(NamedTuple):
+class RingReturns(NamedTuple):
     """Returns of one scan in ring order, with their neighbours along azimuth."""
 
     order: Indices  # (P,) index of each return in the scan
@@ -63,12 +63,12 @@ class Sweep(NamedTuple):
         close = np.abs(key[index] - wanted) < 1.5 * self.shot_rad
         return index, close & (self.ring[index] == self.ring + step)
 
-    def turned(self, start: Indices, end: Indices) -> Floats:
+    def azimuth_between(self, start: Indices, end: Indices) -> Floats:
         """Azimuth from each return ``start`` forward to ``end``, radians in [-0.1, 2 pi - 0.1)."""
         return _forward(self.azimuth[end] - self.azimuth[start])
 
 
-def sweep_of(points: Floats, sensor: LidarSensor) -> Sweep | None:
+def sweep_of(points: Floats, sensor: LidarSensor) -> RingReturns | None:
     """Ring structure of the returns of one scan; None if it is not stored ring after ring.
 
     The shots per turn follow from the mean azimuth step over unbroken neighbours; the median would
@@ -87,7 +87,7 @@ def sweep_of(points: Floats, sensor: LidarSensor) -> Sweep | None:
         return None
     shot_rad = float(ahead[ahead < _UNBROKEN * np.median(ahead)].mean())
     missing = np.maximum(np.rint(step / shot_rad).astype(np.int64) - 1, 0)
-    return Sweep(order, ring, turn, shot_rad, missing)
+    return RingReturns(order, ring, turn, shot_rad, missing)
 
 
 class Ground(NamedTuple):
@@ -135,7 +135,7 @@ class Upright(NamedTuple):
     step_m: Floats  # (P,) range minus the line through the neighbouring rings; NaN from 60 degrees
 
 
-def upright_surfaces(points: Floats, range_m: Floats, sweep: Sweep, ground: Mask) -> Upright:
+def upright_surfaces(points: Floats, range_m: Floats, sweep: RingReturns, ground: Mask) -> Upright:
     """Surfaces met by the returns ``(P, 3)`` of one scan, all in the order of the sweep."""
     on_line = _on_line(range_m, sweep)
     up, has_up = sweep.other_ring(-1)
@@ -172,32 +172,32 @@ def _forward(angle: Floats) -> Floats:
     return (angle + _JITTER_RAD) % (2 * math.pi) - _JITTER_RAD
 
 
-def _on_line(range_m: Floats, sweep: Sweep) -> Mask:
+def _on_line(range_m: Floats, sweep: RingReturns) -> Mask:
     """Whether the outer neighbours along the ring lie on a line.
 
     The inner ones and the return itself are not tested: that would cut the tails of the residuals.
     """
     first, last = sweep.neighbour(-_REACH), sweep.neighbour(_REACH)
-    whole = sweep.turned(first, last)
+    whole = sweep.azimuth_between(first, last)
     smooth = (whole > 0) & (whole < 2 * (_REACH + MAX_GAP_SHOTS) * sweep.shot_rad)
     shots = np.maximum(np.rint(whole / sweep.shot_rad).astype(np.int64), 1)
     smooth &= level_enough(range_m[first], range_m[last], shots)
     for inner in (sweep.neighbour(1 - _REACH), sweep.neighbour(_REACH - 1)):
-        share = sweep.turned(first, inner) / np.where(whole > 0, whole, 1.0)
+        share = sweep.azimuth_between(first, inner) / np.where(whole > 0, whole, 1.0)
         line = range_m[first] + share * (range_m[last] - range_m[first])
         smooth &= np.abs(range_m[inner] - line) < _SMOOTH_M
     return smooth
 
 
-def _residual(range_m: Floats, sweep: Sweep) -> Floats:
+def _residual(range_m: Floats, sweep: RingReturns) -> Floats:
     """Range minus the line through both neighbours along the ring, NaN next to a lost shot.
 
-    Divided by the error growth of that line: the deviation is that of a single range.
+    Divided by the error growth of this line, it deviates as a single range does.
     """
     before, after = sweep.neighbour(-1), sweep.neighbour(1)
-    whole = sweep.turned(before, after)
+    whole = sweep.azimuth_between(before, after)
     unbroken = (sweep.missing[before] == 0) & (sweep.missing == 0) & (whole > 0)
-    share = sweep.turned(before, np.arange(len(before))) / np.where(unbroken, whole, 1.0)
+    share = sweep.azimuth_between(before, np.arange(len(before))) / np.where(unbroken, whole, 1.0)
     line = range_m[before] + share * (range_m[after] - range_m[before])
     growth = np.sqrt(1 + share**2 + (1 - share) ** 2)
     return np.where(unbroken & (share > 0) & (share < 1), (range_m - line) / growth, np.nan)

@@ -37,7 +37,7 @@ def check_fields(values: object, rule: Rule, *names: str) -> None:
 
 
 class Semantic(IntEnum):
-    """Class ids of the labels, those of KITTI-360."""
+    """Class ids of the labels, as in KITTI-360."""
 
     UNLABELED = 0
     EGO_VEHICLE = 1
@@ -243,11 +243,13 @@ def draw_weather(generator: np.random.Generator) -> Conditions:
     if air >= _CLEAR_DRY + _CLEAR_WET:
         kind = int(3 * third)
         if kind == 0:
-            visibility_m, film_mm = _even_logarithm(generator, (30.0, 1000.0)), 0.0
+            visibility_m = _even_logarithm(generator, (30.0, 1000.0))
+            film_mm = 0.0
         elif kind == 1:
             rain_mm_h = _even_logarithm(generator, (1.0, 30.0))
         else:
-            snow_mm_h, film_mm = _even_logarithm(generator, (0.5, 3.0)), 0.0
+            snow_mm_h = _even_logarithm(generator, (0.5, 3.0))
+            film_mm = 0.0
     return Conditions(
         visibility_m, rain_mm_h, snow_mm_h, film_mm, False, elevation_deg, azimuth_deg
     )

@@ -112,8 +112,8 @@ def windows_of(
 ) -> Windows:
     """Beams and shots whose rays can meet each solid, from its bounding box seen from above.
 
-    The first pass takes the rays to start anywhere that any of them does, which a moving sensor
-    spreads over a metre; the second looks up where those of the first window really start.
+    A moving sensor spreads the origins of the rays over a metre. The first pass allows each ray to
+    start at any of them; the second uses the actual origins of the rays in the first window.
     """
     fan = _fan(origin, direction)
     reach = np.zeros(len(solids.shape))

@@ -196,7 +196,7 @@ class Sweep:
         surface: NDArray[np.int32] | None = None,
         ego: float = 0,
     ) -> NDArray:
-        """Values ``(M,)`` of surfaces, by default those of the cast, 0 for ``NO_SURFACE``.
+        """Values ``(M,)`` of surfaces, by default the cast ones, 0 for ``NO_SURFACE``.
 
         ``values``: one per primitive of the scene. ``ego``: of the recording car.
         """
@@ -218,7 +218,7 @@ class Sweep:
         return np.flatnonzero(IS_GROUND[self.material] & (self.first.surface >= GROUND))
 
     def on_sheets(self) -> NDArray[np.bool_]:
-        """Which rays ``(R,)`` now have an echo of retro-reflecting sheeting."""
+        """Mask of the rays ``(R,)`` whose echo comes from retro-reflecting sheeting."""
         is_sheet = [p.material is Material.RETROREFLECTOR for p in self.scene.primitives]
         return self.of_surface(is_sheet, 0, bool)
 
@@ -246,7 +246,8 @@ class Sweep:
         """Whether nothing stands in a direction ``(3,)`` in the middle of the sweep."""
         nothing = np.full(1, NO_SURFACE, dtype=np.int32)
         here, towards = self.start.mean(axis=1, keepdims=True), direction[:, None]
-        now, reach_m = np.zeros(1, dtype=np.float32), np.full(1, 1e3)
+        now = np.zeros(1, dtype=np.float32)
+        reach_m = np.full(1, 1e3)
         _, surface = cast_single(self.solids, here, towards, now, reach_m, nothing, nothing)
         return bool(surface[0] == NO_SURFACE)
 
@@ -303,7 +304,7 @@ class Sweep:
         """
         codes = [p.semantic | p.instance << 16 for p in self.scene.primitives]
         coded = self.of_surface(codes, Semantic.ROAD, np.uint32, surface, Semantic.EGO_VEHICLE)
-        # Other echoes from the air have no surface; those of a halo keep that of their sheet.
+        # Other echoes from the air have no surface; echoes of a halo keep the label of their sheet.
         coded[origin == Origin.BLOOMING] = Semantic.UNLABELED
         return coded
 

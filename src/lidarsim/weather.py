@@ -324,8 +324,8 @@ def _result(
 
 def _by_origin(origins: NDArray[np.uint8]) -> dict[str, int]:
     """Number of points of each origin that occurs, by its name."""
-    found, counts = np.unique(origins, return_counts=True)
-    return {Origin(o).name.lower(): int(n) for o, n in zip(found, counts, strict=True)}
+    codes, counts = np.unique(origins, return_counts=True)
+    return {Origin(o).name.lower(): int(n) for o, n in zip(codes, counts, strict=True)}
 
 
 def _vehicles(boxes: NDArray[np.floating] | None) -> tuple[Primitive, ...]:

@@ -437,7 +437,7 @@ def pad_batch(values: Tensor, size: int) -> Tensor:
 
 
 def scene_indices(indices: int | Sequence[int]) -> Sequence[int]:
-    """Numbers of scenes; a number stands for that many from 0 on.
+    """Numbers of scenes; a single number n stands for 0 to n - 1.
 
     Raises:
         ValueError: If there is none.

@@ -24,6 +24,7 @@ from lidarsim.io import (
     differences,
     first_line,
     in_processes,
+    json_values,
     no_follow,
     only_writer,
     refuse_name,
@@ -46,6 +47,7 @@ __all__ = [
     "differences",
     "first_line",
     "in_processes",
+    "json_values",
     "machine",
     "no_follow",
     "one_line",
@@ -81,7 +83,7 @@ def weights_sha256(state: Mapping[str, Tensor], *, ordered: bool = True) -> str:
 
     Args:
         state: Weights by name.
-        ordered: Take the names in alphabetical order, else in that of ``state``, as the hashes of
+        ordered: Take the names in alphabetical order, else in the order of ``state``, as hashes of
             feature extractors do that files of feature grids and references hold.
     """
     import torch

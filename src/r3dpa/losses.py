@@ -75,7 +75,7 @@ def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
 
 
 def return_loss(logits: Tensor, returns: Tensor) -> Tensor:
-    """Cross-entropy ``(B,)`` of the logits of a return, both ``(B, 1, H, W)``, in nats a pixel."""
+    """Cross-entropy ``(B,)`` of return logits, both ``(B, 1, H, W)``, in nats per pixel."""
     each = F.binary_cross_entropy_with_logits(logits.float(), returns.float(), reduction="none")
     return each.flatten(1).mean(dim=1)
 
@@ -120,8 +120,8 @@ def balanced_gradient(image: Tensor, ratio: float) -> Tensor:
     image = image.view_as(image)  # the gradients of other losses stay as they are
 
     def scaled(gradient: Tensor) -> Tensor:
-        own = gradient.flatten(1).norm(dim=1).clamp(min=1e-30)
-        return gradient * (length / own)[:, None, None, None]
+        norms = gradient.flatten(1).norm(dim=1).clamp(min=1e-30)
+        return gradient * (length / norms)[:, None, None, None]
 
     if image.requires_grad:
         image.register_hook(scaled)

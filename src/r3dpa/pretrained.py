@@ -1,4 +1,4 @@
-"""Trained weights by name: those of this package, files, and repositories of Hugging Face."""
+"""Trained weights by name: shipped with this package, in files, or on Hugging Face."""
 
 from __future__ import annotations
 
@@ -113,8 +113,8 @@ def _from_hub(place: str) -> Path:
         folder = Path(snapshot_download(f"{owner}/{name}", allow_patterns=patterns))
     except (OSError, ValueError) as error:  # requests' errors are OSErrors
         raise ValueError(f"hf://{place} cannot be read: {first_line(error)}") from error
-    found = sorted(folder.rglob(file or "*.safetensors"))
-    if len(found) != 1:
-        names = ", ".join(path.name for path in found) or "none"
+    files = sorted(folder.rglob(file or "*.safetensors"))
+    if len(files) != 1:
+        names = ", ".join(path.name for path in files) or "none"
         raise ValueError(f"hf://{place}: expected one .safetensors file, found {names}; name one")
-    return found[0]
+    return files[0]

@@ -94,7 +94,7 @@ class SceneVAE:
         """Scenes of raw latents ``(B, C, h, w)``, with what the VAE has of intensity and labels.
 
         Raises:
-            ValueError: If the latents have another shape than those of the VAE.
+            ValueError: If the latents do not have the shape of the VAE's latents.
         """
         projection = self.geometry.projection
         sensor = projection.sensor

@@ -9,7 +9,7 @@ import pytest
 from tiny_evaluations import evaluation
 
 from r3dpa.ablation import write_table
-from r3dpa.ablation.plan import Plan, Row, Stage, Table
+from r3dpa.ablation.plan import Plan, PlannedStage, Row, Table
 from r3dpa.ablation.tables import order_results
 from r3dpa.metrics.results import Evaluation, MetricResult
 from r3dpa.metrics.seeds import mean_of_seeds
@@ -79,7 +79,7 @@ def recorded(name, out):
     for row in stored["rows"]:
         chains = {}
         for seed, names in row["stages"].items():
-            chain = [Stage(stage, out / stage, [], {}, ()) for stage in names]
+            chain = [PlannedStage(stage, out / stage, [], {}, ()) for stage in names]
             results = [
                 MetricResult(metric, value, row["intervals"][seed][metric])
                 for metric, value in row["values"][seed].items()

@@ -71,8 +71,8 @@ class TestSimulate:
     @pytest.mark.parametrize(
         ("words", "message"),
         [
-            (["--effects.fogg", "off"], "there is no effect 'fogg'; there are dual_return, "),
-            (["--sensor", "hdl65e"], "there is no sensor 'hdl65e': give hdl64e, "),
+            (["--effects.fogg", "off"], "unknown effect 'fogg'; choose from dual_return, "),
+            (["--sensor", "hdl65e"], "unknown sensor 'hdl65e'; choose from hdl64e, "),
             (["--weather.rain_mm_h", "-1"], "^rain_mm_h must be 0 or greater, got -1"),
         ],
     )

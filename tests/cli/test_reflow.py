@@ -13,7 +13,7 @@ from test_baselines import fit_words
 
 from lidarsim import simulate
 from r3dpa.baselines import ReflowPairs
-from r3dpa.baselines.reflow import as_scanned
+from r3dpa.baselines.reflow import clamp_to_sensor
 from r3dpa.checkpoints import read_checkpoint
 from r3dpa.cli import main
 from r3dpa.flow.sampler import SamplerConfig
@@ -82,7 +82,7 @@ def test_a_pair_is_noise_and_what_the_flow_makes_of_it(flow, pairs_root, monkeyp
         pair = pairs.train_set[index]
         with torch.no_grad():
             scene = euler(generator.velocity, pair["noise"][None], ode_times(3))
-        expected = as_scanned(scene, generator.geometry)[0]
+        expected = clamp_to_sensor(scene, generator.geometry)[0]
         torch.testing.assert_close(pair["range_image"], expected, atol=1e-4, rtol=0)
     assert not torch.equal(pairs.train_set[0]["noise"], pairs.train_set[1]["noise"])
 

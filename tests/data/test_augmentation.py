@@ -251,12 +251,12 @@ def test_weather_of_points_to_prepare(data):
 
 
 def test_weather_is_refused_where_something_would_not_follow(data, scaled_points):
-    with pytest.raises(ValueError, match="weather: the feature grids are those of the clear"):
+    with pytest.raises(ValueError, match="weather: the feature grids belong to the clear"):
         data(weather=STORMY, extractor=scaled_points())
     data(weather=STORMY, extractor=scaled_points(), augmentation=BOTH)
     with pytest.raises(ValueError, match="no order of rings: use projection: spherical"):
         data(weather=STORMY, projection="rings")
-    with pytest.raises(ValueError, match="weather: cached posteriors are those of the clear"):
+    with pytest.raises(ValueError, match="weather: cached posteriors belong to the clear"):
         data(weather=STORMY).use_posteriors(None)
     for wrong in ({"probability": 2}, {"rain_mm_h": (0, 1)}, {"visibility_m": (0.5, 9)}):
         with pytest.raises(ValueError, match=next(iter(wrong))):

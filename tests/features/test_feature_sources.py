@@ -25,9 +25,9 @@ def test_each_name_gives_its_extractor(scalr_file):
 
 
 def test_refused_names_and_checkpoints(scalr_file):
-    with pytest.raises(ValueError, match="no feature source 'dino'; there are scalr, waffleiron-s"):
+    with pytest.raises(ValueError, match="source 'dino'; choose from scalr, waffleiron-s"):
         feature_source("dino")
-    with pytest.raises(ValueError, match=r"scalr needs ckpt.*one of waffleiron-s, geometric"):
+    with pytest.raises(ValueError, match=r"scalr needs ckpt.*choose from waffleiron-s, geometric"):
         feature_source("scalr")
     with pytest.raises(ValueError, match=r"ckpt_last.pth has features of width 4, but dim is 768"):
         feature_source("scalr", scalr_file)

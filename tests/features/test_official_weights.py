@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from r3dpa.features import ScaLR, WaffleIron, scalr
-from r3dpa.features.official import renamed
+from r3dpa.features.official import key_renamer
 from r3dpa.geometry import LidarSensor
 from r3dpa.metrics.networks import (
     SPVCNN,
@@ -48,14 +48,14 @@ VIT = {"width": 24, "depth": 2, "num_heads": 3}
 RELEASES = {
     "rangevit": Release(
         lambda: RangeViT(SENSOR, 4, **VIT, skip_channels=6, trained_size=TRAINED),
-        renamed(rangevit._NAMES),
+        key_renamer(rangevit._NAMES),
         lambda path: RangeViT.from_checkpoint(path, SENSOR, num_heads=3, trained_size=TRAINED),
         "rangevit.encoder.blocks.1.norm2.bias",
         "rangevit.encoder.blocks.0.mlp.fc1.bias",
     ),
     "liploc": Release(
         lambda: LIPLoc(picture_side=32, patch_side=8, **VIT),
-        lambda key: liploc._ENCODER + renamed(liploc._NAMES)(key),
+        lambda key: liploc._ENCODER + key_renamer(liploc._NAMES)(key),
         lambda path: LIPLoc.from_checkpoint(path, num_heads=3),
         "encoder_lidar.model.blocks.1.norm2.bias",
         "encoder_lidar.model.blocks.0.mlp.fc1.bias",

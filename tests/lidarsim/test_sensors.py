@@ -101,7 +101,7 @@ def test_bad_calibrations_are_named(tmp_path):
     path.write_text(calibration(0.1, 0.1, 0.1))
     with pytest.raises(ValueError, match=r"unit\.yaml: inclination_rad of the lasers must fall"):
         load_sensor(str(path))
-    with pytest.raises(ValueError, match=r"no sensor 'hdl65e': give hdl64e, hdl32e, vls128 or"):
+    with pytest.raises(ValueError, match=r"'hdl65e'; choose from hdl64e, hdl32e, vls128, or"):
         load_sensor("hdl65e")
 
 

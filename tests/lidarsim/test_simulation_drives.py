@@ -326,9 +326,9 @@ def test_split_of_chosen_drives():
         ({"scans": 0}, "scans must be 1 or greater, got 0"),
         ({"workers": 0}, "workers must be 1 or greater, got 0"),
         ({"seed": -1}, "seed must be 0 or greater, got -1"),
-        ({"sensor": "lidar"}, "no sensor 'lidar'"),
+        ({"sensor": "lidar"}, "unknown sensor 'lidar'"),
         ({"drives": ["3"]}, "got 3"),
-        ({"effects": {"fogg": "off"}}, r"no effect 'fogg'; there are dual_return, "),
+        ({"effects": {"fogg": "off"}}, r"unknown effect 'fogg'; choose from dual_return, "),
         ({"effects": {"range_noise": "of"}}, "range_noise must be auto, on or off, got 'of'"),
     ],
 )

@@ -265,7 +265,7 @@ def test_effects_that_need_a_scene_are_refused_by_name(scan, name):
         (lambda s: replace(s, points=s.points * np.nan), "are NaN or infinite: drop them first"),
         (lambda s: replace(s, points=s.points * 100), "give metres"),
         (lambda s: replace(s, labels=s.labels[1:]), "labels must have one value for each"),
-        (lambda s: Weather().apply(s, effects={"hail": "on"}), "there is no effect 'hail'"),
+        (lambda s: Weather().apply(s, effects={"hail": "on"}), "unknown effect 'hail'"),
         (lambda s: Weather(visibility_m=0), "visibility_m must be 1 or greater"),
         (lambda s: Weather(rain_mm_h=10_000), "rain_mm_h must be at most"),
         (lambda s: Weather(traffic_m_s=-1), "traffic_m_s must be 0 or greater"),

@@ -18,10 +18,10 @@ from r3dpa.baselines.readers import (
     from_r2flow,
     hdit_weights,
     image_geometry,
-    time_reversed,
+    reverse_time,
     unet_weights,
 )
-from r3dpa.baselines.reflow import as_scanned
+from r3dpa.baselines.reflow import clamp_to_sensor
 from r3dpa.flow import Interpolant, sample_time
 from r3dpa.flow.interpolant import _exponential
 from r3dpa.flow.solvers import ab3, euler
@@ -53,7 +53,7 @@ def hdit(baseline_case):
     """Case and network; its weights are translated."""
     case = baseline_case("r2flow_hdit")
     network = hdit_of(case.config)
-    network.load_state_dict(hdit_weights(time_reversed(case.weights())))
+    network.load_state_dict(hdit_weights(reverse_time(case.weights())))
     return case, network
 
 
@@ -77,7 +77,7 @@ def outputs_of(case, network):
 def gradients_of(network, loss, **options):
     loss.backward(**options)
     own = {name: p.grad for name, p in network.named_parameters()}
-    found = time_reversed(own | dict(network.named_buffers()))
+    found = reverse_time(own | dict(network.named_buffers()))
     network.zero_grad()
     return found
 
@@ -156,7 +156,7 @@ def unet_of(kind, case):
     config = {key: value for key, value in case.config.items() if key not in ("seed", "ring")}
     assert case.config["ring"]
     network = kind(**config)
-    network.load_state_dict(unet_weights(time_reversed(case.weights())))
+    network.load_state_dict(unet_weights(reverse_time(case.weights())))
     return network
 
 
@@ -266,7 +266,7 @@ def reflow_of(case, network, geometry):
     noise = torch.stack([torch.randn(shape, generator=draw) for draw in draws])
     data = euler(network, noise, ode_times(4))
     sensor = geometry.projection.sensor
-    pairs = as_scanned(data, geometry)
+    pairs = clamp_to_sensor(data, geometry)
     range_m = geometry.codec.ranges_of(pairs, sensor).clamp(min=0)
     results = {
         "out/reflow_x_0_cpu": noise,

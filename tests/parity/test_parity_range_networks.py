@@ -9,7 +9,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from r3dpa.features.official import load_strictly, renamed
+from r3dpa.features.official import key_renamer, load_strictly
 from r3dpa.geometry import LidarSensor
 from r3dpa.metrics.networks import liploc, rangevit
 from r3dpa.metrics.networks.liploc import LIPLoc, wrapped_grey_levels, wrapped_picture
@@ -146,7 +146,7 @@ def test_liploc_encoder_feature(load_case, pictures, tmp_path, close):
     assert (config["num_classes"], config["global_pool"]) == (0, "avg")
     sizes = ("img_size", "patch_size", "embed_dim", "depth", "num_heads")
     network = LIPLoc(*(config[size] for size in sizes))
-    load_strictly(network, weights, renamed(liploc._NAMES))
+    load_strictly(network, weights, key_renamer(liploc._NAMES))
     range_m = pictures["in/depth"][None]
     close(network(range_m), case["out/feature"])
     # As the authors release it: the whole model, of which the rest has no part in the features.
@@ -163,6 +163,6 @@ def test_liploc_encoder_released_sizes(official_listing):
     with torch.device("meta"):
         network = LIPLoc()
     weights = empty(listing["state_dict"])
-    load_strictly(network, weights, renamed(liploc._NAMES))
+    load_strictly(network, weights, key_renamer(liploc._NAMES))
     assert sum(value.numel() for value in network.parameters()) == listing["param_count"]
     assert network.dim == listing["feature_dim"]

@@ -124,26 +124,26 @@ def _targets_of(sweep: Sweep, rays: Indices) -> _Targets:
             np.where(beam < num_beams - 1, rays + num_shots, rays),
         ]
     )
-    own, own_m = first.surface[rays], first.range_m[rays]
+    solid, solid_m = first.surface[rays], first.range_m[rays]
     other, other_m = first.surface[beside], first.range_m[beside]
     # Only a solid that ends before something else is missed by the rim of the ray that meets it.
-    ends = (own >= 0) & ((other != own) & (other_m > own_m + _EDGE_M)).any(axis=0)
+    ends = (solid >= 0) & ((other != solid) & (other_m > solid_m + _EDGE_M)).any(axis=0)
     ends &= (first.origin[rays] == Origin.SURFACE) & ~IS_GROUND[sweep.material[rays]]
-    wanted = (other >= GROUND) & (first.origin[beside] == Origin.SURFACE) & (other != own)
-    wanted &= ends | (other_m < own_m - _EDGE_M)
+    wanted = (other >= GROUND) & (first.origin[beside] == Origin.SURFACE) & (other != solid)
+    wanted &= ends | (other_m < solid_m - _EDGE_M)
     for later in range(1, len(beside)):
         wanted[later] &= ~(wanted[:later] & (other[:later] == other[later])).any(axis=0)
 
     thin_ray, thin = _beside_thin_solids(sweep)
     row = np.searchsorted(rays, thin_ray).clip(max=len(rays) - 1)
-    new = (rays[row] == thin_ray) & (own[row] != thin)
+    new = (rays[row] == thin_ray) & (solid[row] != thin)
     new &= ~(wanted[:, row] & (other[:, row] == thin)).any(axis=0)
     row, thin = row[new], thin[new].astype(np.int32)
     order = np.lexsort((thin, row))
     row, thin = row[order], thin[order]
     rank = np.arange(len(row)) - np.searchsorted(row, row)
 
-    layers = [(every_row, own, rays)]
+    layers = [(every_row, solid, rays)]
     layers += [
         (every_row[chosen], other[side, chosen], beside[side, chosen])
         for side, chosen in enumerate(wanted)
@@ -155,7 +155,7 @@ def _targets_of(sweep: Sweep, rays: Indices) -> _Targets:
     bounds = np.cumsum([0, *(len(layer[0]) for layer in layers)])
     row, surface, seen_by = (np.concatenate(columns) for columns in zip(*layers, strict=True))
     # Surfaces without an edge fill the beam of the ray whose axis meets them.
-    range_m = np.repeat(own_m[row][None], len(_RING_LEFT), axis=0)
+    range_m = np.repeat(solid_m[row][None], len(_RING_LEFT), axis=0)
     tested = np.append(np.flatnonzero(ends), np.arange(len(rays), len(row)))
     range_m[:, tested] = _rim_ranges(sweep, rays[row[tested]], surface[tested])
     seen_m = first.range_m[seen_by]
@@ -218,7 +218,8 @@ def _peaks(targets: _Targets, met: Indices, range_m: Floats, merge_m: float) -> 
     with np.errstate(invalid="ignore"):
         apart = np.diff(range_m, axis=0) >= merge_m
     peak_of = np.vstack([np.zeros_like(apart[:1]), apart]).cumsum(axis=0)
-    columns, num_rays = np.arange(met.shape[1]), met.shape[1]
+    columns = np.arange(met.shape[1])
+    num_rays = met.shape[1]
     none = np.zeros(num_rays, dtype=np.float32)
     first = second = _Peak(none + np.inf, none, np.full(num_rays, -1), none > 0)
     for number in range(peak_of.max(initial=-1) + 1):
@@ -235,20 +236,25 @@ def _peaks(targets: _Targets, met: Indices, range_m: Floats, merge_m: float) -> 
     return first, second
 
 
-def _either(chosen: NDArray[np.bool_], one: _Peak, other: _Peak) -> _Peak:
-    pairs = ((np.asarray(a), np.asarray(b)) for a, b in zip(one, other, strict=True))
+def _either(chosen: NDArray[np.bool_], first: _Peak, other: _Peak) -> _Peak:
+    pairs = ((np.asarray(a), np.asarray(b)) for a, b in zip(first, other, strict=True))
     return _Peak(*(np.where(chosen, a, b) for a, b in pairs))
 
 
 def _record(
-    sweep: Sweep, rays: Indices, own: Indices, targets: _Targets, strongest: _Peak, next_one: _Peak
+    sweep: Sweep,
+    rays: Indices,
+    own_pair: Indices,
+    targets: _Targets,
+    strongest: _Peak,
+    next_one: _Peak,
 ) -> None:
-    """Replace the echoes of rays whose own pairs are ``own``."""
+    """Replace the echoes of rays whose own pairs are ``own_pair``."""
     first = sweep.first
     own_origin = first.origin[rays]
 
     def columns(peak: _Peak, seen: Indices) -> tuple[Floats, Floats, Surfaces, NDArray[np.uint8]]:
-        origin = np.where(peak.target == own, own_origin, np.uint8(Origin.SURFACE))
+        origin = np.where(peak.target == own_pair, own_origin, np.uint8(Origin.SURFACE))
         origin = np.where(peak.mixed, np.uint8(Origin.MIXED), origin)
         surface = targets.surface[peak.target[seen]]
         return peak.range_m[seen], peak.power[seen], surface, origin[seen]
@@ -364,7 +370,8 @@ def _seen_from(sweep: Sweep, rays: Indices, solid: Indices) -> tuple[Floats, Flo
     """Distances of the centres of solids ahead of rays and to their left, seen from above."""
     x, y = sweep.solids.centre[solid, :2].T - sweep.start[:2, rays]
     if sweep.actor_time_s is not None:
-        velocity, time_s = sweep.solids.velocity[solid].T, sweep.actor_time_s[rays]
+        velocity = sweep.solids.velocity[solid].T
+        time_s = sweep.actor_time_s[rays]
         x, y = x + velocity[0] * time_s, y + velocity[1] * time_s
     along, across = sweep.direction[:2, rays]
     length = np.sqrt(along * along + across * across)

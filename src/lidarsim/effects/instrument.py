@@ -108,7 +108,7 @@ class LostShots(Effect):
     (30 scans of four drives), at strong echoes as well as at weak ones.
 
     Args:
-        upright: Factor of all materials but those of the ground.
+        upright: Factor of all materials except ground materials.
         rough: Factor of leaves, cloth and paint, whose echoes come from several depths or leave
             in the direction of a mirror.
         goes_on: Probability that the next shot is lost as well, in [0, 1).

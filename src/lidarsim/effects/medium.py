@@ -111,7 +111,8 @@ def soft_waveform(
     visibility_m: float, sensor: SpinningLidar
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Reported ranges ``(K,)`` and power ``(K,)`` of the backscatter from there, m^-2."""
-    extinction, half_pulse_m = math.log(20) / visibility_m, sensor.pulse_depth_m / 2
+    extinction = math.log(20) / visibility_m
+    half_pulse_m = sensor.pulse_depth_m / 2
     edges = range_edges(sensor, _FOG_STEP_M)
     everywhere = np.arange(0.0, sensor.max_range_m + half_pulse_m + _FOG_STEP_M, _FOG_STEP_M)
     density = np.exp(-2 * extinction * everywhere) * overlap_by_square(everywhere, sensor)
@@ -138,7 +139,7 @@ class Spray(Effect):
         backscatter * min(c tau / 2, L) * xi(r) / r^2
 
     Source: 0.05 to 0.2 per metre in the plumes of cars at 60 to 90 km/h; the depth at which a road
-    counts as flooded is that of wet-ground models.
+    counts as flooded comes from wet-ground models.
 
     Args:
         max_extinction_per_m: Extinction behind a vehicle at 20 m/s or more on a flooded road.
@@ -157,7 +158,9 @@ class Spray(Effect):
         return sweep.all_near(boxes, sweep.time_s)
 
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
-        sensor, scene, boxes = sweep.sensor, sweep.scene, _plumes(sweep.scene)
+        sensor = sweep.sensor
+        scene = sweep.scene
+        boxes = _plumes(sweep.scene)
         solids = solids_of(boxes, scene.pose, scene.ground_m)
         flooded = scene.weather.water_film_mm / 1.2
         drawn = draws.uniform(slice(None))
@@ -199,7 +202,8 @@ def _around(
     solids: Solids, index: int, sweep: Sweep, rays: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], Floats]:
     """Rays that meet a box as seen from above, and their start relative to the box."""
-    direction, shift = sweep.direction[:2, rays], solids.velocity[index][:, None]
+    direction = sweep.direction[:2, rays]
+    shift = solids.velocity[index][:, None]
     to_centre = solids.centre[index, :2, None] + shift * sweep.time_s[rays]
     to_centre -= sweep.start[:2, rays]
     # Rays in the box's axes, and how far it reaches along them and to their sides.
@@ -368,7 +372,7 @@ class Rain(_Hydrometeors):
 class Snow(_Hydrometeors):
     """Snow attenuates every echo, and flakes may outshine weak targets.
 
-    Equations: :class:`_Hydrometeors`. Diameters are those of the molten flakes. Ice
+    Equations: :class:`_Hydrometeors`. Diameters are of the molten flakes. Ice
     crystals return 2 pi / S = 0.3 of the echo of a white disk, with S = 20 sr their ratio of
     extinction to backscatter. At 1 mm/h the extinction is 1.4e-3 per metre.
 
@@ -386,7 +390,8 @@ class Snow(_Hydrometeors):
 def _between(table: NDArray, row: NDArray[np.intp], column: NDArray) -> NDArray:
     """Entries (M,) of rows of a table (P, K), between its columns."""
     left = np.minimum(column.astype(np.intp), table.shape[1] - 2)
-    flat, at = table.reshape(-1), row * table.shape[1] + left
+    flat = table.reshape(-1)
+    at = row * table.shape[1] + left
     lower = flat[at]
     return lower + (column - left) * (flat[at + 1] - lower)
 

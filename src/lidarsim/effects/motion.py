@@ -113,8 +113,8 @@ class FoliageOcclusion(Effect):
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
         shift = int(sweep.num_rays * draws.uniform(slice(0, 1))[0])
         shared, factor = (np.roll(values, shift) for values in _clumps(sweep.shape))
-        own = np.float32(math.sqrt(1 - _ALIKE**2)) * draws.normal(slice(None))
-        sweep.optical_depth = -np.log(ndtr(-shared - own)) * factor
+        single = np.float32(math.sqrt(1 - _ALIKE**2)) * draws.normal(slice(None))
+        sweep.optical_depth = -np.log(ndtr(-shared - single)) * factor
 
 
 @lru_cache(maxsize=4)

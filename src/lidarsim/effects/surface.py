@@ -158,7 +158,7 @@ class RetroReflection(Effect):
 def fresnel_reflectance(cos_incidence: Floats, index: float) -> Floats:
     """Share of unpolarised light that one smooth surface from air to a medium reflects.
 
-    With c the cosine of incidence and c' that of refraction, ``c'^2 = 1 - (1 - c^2) / n^2``::
+    With c the cosine of incidence and c' the cosine of refraction, ``c'^2 = 1 - (1 - c^2) / n^2``::
 
         F = ((c - n c') / (c + n c'))^2 / 2 + ((n c - c') / (n c + c'))^2 / 2
 
@@ -183,7 +183,7 @@ class Glass(Effect):
     0.918 and 0.082 at normal incidence, 0.24 and 0.76 at 85 degrees (where F of one surface is
     0.61). With ``surface_power`` along the whole path, the echoes have the power::
 
-        dirt      that of the pane's own reflectivity      its surface, as cast
+        dirt      as of the pane's own reflectivity        its surface, as cast
         behind    T^2 * surface_power(object)              0.843 of it at normal incidence
         mirrored  (1 - T)^2 * surface_power(object)        at the first direction
 

@@ -196,7 +196,8 @@ def load_sensor(model: str, **changes: Any) -> SpinningLidar:
     path = Path(model)
     if not path.is_file():
         raise ValueError(
-            f"there is no sensor {model!r}: give {', '.join(PRESETS)} or a calibration YAML"
+            f"unknown sensor {model!r}; choose from {', '.join(PRESETS)}, or give a calibration "
+            "YAML"
         )
     return SpinningLidar(_read_calibration(path), **changes)
 

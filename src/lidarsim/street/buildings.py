@@ -21,7 +21,7 @@ from lidarsim.street.vehicles import DIRT, coat
 # Diffuse reflectivity at 905 nm, and the share of brick houses: the rest is plastered.
 _BRICK, _PLASTER = (0.11, 0.17), (0.13, 0.22)
 _BRICK_SHARE = 0.25
-# A facade is stepped into parts of about this width; each may stand back by so much.
+# Width of the parts that a facade is stepped into, and how far a part may stand back.
 _PART_M, _STEP_M = (2.8, 6.5), (0.4, 2.6)
 # Sill and lintel of the ground floor above the pavement, and the reveal of its windows.
 _SILL_M, _LINTEL_M = (0.75, 1.3), (2.1, 2.5)

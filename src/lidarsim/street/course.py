@@ -106,7 +106,7 @@ class Section(NamedTuple):
     """The street in one block: a straight piece of a chain whose pieces meet at their ends.
 
     Positions are the distance ``s`` along the chain and the lateral distance, positive to the
-    left. Heights are those of a plane; on the bisectors of the corners neighbouring planes meet to
+    left. Heights follow a plane; on the bisectors of the corners neighbouring planes meet to
     within 2 cm over the width of the road.
     """
 
@@ -239,10 +239,10 @@ class Course(NamedTuple):
         """Heading, its change per metre, and slope: even between the middles of the blocks."""
         before = math.floor(s / BLOCK_M - 0.5)
         share = s / BLOCK_M - 0.5 - before
-        one, other = self.section_of(before), self.section_of(before + 1)
-        turn = other.heading_rad - one.heading_rad
-        slope = (1 - share) * one.slope + share * other.slope
-        return one.heading_rad + share * turn, turn / BLOCK_M, slope
+        first, second = self.section_of(before), self.section_of(before + 1)
+        turn = second.heading_rad - first.heading_rad
+        slope = (1 - share) * first.slope + share * second.slope
+        return first.heading_rad + share * turn, turn / BLOCK_M, slope
 
 
 @lru_cache(maxsize=32)

@@ -16,7 +16,7 @@ from lidarsim.street.builder import FOOTING_M, Builder
 from lidarsim.street.trees import LEAVES
 from lidarsim.street.vehicles import DIRT, bicycle
 
-# Lamps: those of roads on masts of 5 to 9 m, those of paths and squares of 3.2 to 4.2 m; the foot
+# Lamps of roads stand on masts of 5 to 9 m, of paths and squares on 3.2 to 4.2 m; the foot
 # of a mast, behind whose door the fuses are, is thicker up to 0.9 m.
 _MAST_M, _LOW_MAST_M, _FOOT_M = (5.0, 9.0), (3.2, 4.2), (0.18, 0.9)
 # Posts of signs are tubes of 60 or 76 mm; sheets have edges or diameters of 0.42 to 0.9 m and hang
@@ -86,7 +86,8 @@ def sign(builder: Builder, draw: Generator, s: float, lateral: float, side: floa
     edge_m, high_m = draw.uniform(*_SHEET_M), draw.uniform(*_SHEET_HIGH_M)
     size = (thick_m, thick_m, high_m + edge_m + 0.05)
     builder.solid(Shape.CYLINDER, (s, lateral), size, *post)
-    at, instance = (before, lateral), builder.new_instance()
+    at = (before, lateral)
+    instance = builder.new_instance()
     builder.solid(Shape.BOX, at, (0.03, edge_m, edge_m), *sheet, instance, high_m)
     if draw.random() < 0.3:
         size = (0.03, min(edge_m, 0.6), 0.33)
@@ -146,7 +147,8 @@ def litter_bin(builder: Builder, draw: Generator, s: float, lateral: float) -> N
 def bench(builder: Builder, draw: Generator, s: float, lateral: float) -> None:
     """A bench, mostly with a back, that faces the road or turns its back on it."""
     look = (Semantic.UNKNOWN_OBJECT, Material.WOOD, 0.14, builder.new_instance())
-    long_m, back = draw.uniform(*_BENCH_M), draw.choice((-1, 1)) * 0.24
+    long_m = draw.uniform(*_BENCH_M)
+    back = draw.choice((-1, 1)) * 0.24
     # Legs of concrete or iron at both ends: of a block of which rays meet only the ends.
     legs_m, legs = (long_m, 0.4, _SEAT_M - 0.05), (long_m - 0.12, 0.12 / (long_m - 0.12))
     builder.solid(Shape.BOX, (s, lateral), legs_m, *look, slats=legs)
@@ -209,7 +211,8 @@ def bicycles(builder: Builder, draw: Generator, s: float, lateral: float) -> Non
         turn = draw.choice((0.0, math.pi)) + draw.normal(0, 0.1)
         builder.body(bicycle(draw), (s, lateral), turn, builder.new_instance())
         return
-    pitch_m, turn = draw.uniform(*_STAND_PITCH_M), draw.choice((1.0, 0.6)) * math.pi / 2
+    pitch_m = draw.uniform(*_STAND_PITCH_M)
+    turn = draw.choice((1.0, 0.6)) * math.pi / 2
     stands = (Semantic.SMALL_POLE, *_STEEL)
     for place in range(int(draw.integers(3, 8))):
         at = (s + pitch_m * place, lateral)
@@ -280,7 +283,8 @@ def power_pole(builder: Builder, draw: Generator, s: float, lateral: float) -> N
     """A pole of an overhead line, of wood or concrete, some with a cable box."""
     wood = draw.random() < 0.7
     look = (Semantic.POLE, Material.WOOD if wood else Material.CONCRETE, 0.15)
-    thick_m, instance = draw.uniform(*_POWER_POLE_THICK_M), builder.new_instance()
+    thick_m = draw.uniform(*_POWER_POLE_THICK_M)
+    instance = builder.new_instance()
     size = (thick_m, thick_m, draw.uniform(*_POWER_POLE_TALL_M) + FOOTING_M)
     builder.solid(Shape.CYLINDER, (s, lateral), size, *look, instance, -FOOTING_M)
     if draw.random() < 0.3:

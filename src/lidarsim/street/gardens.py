@@ -14,12 +14,11 @@ from lidarsim.street.builder import FOOTING_M, Builder
 from lidarsim.street.course import BLOCK_M
 from lidarsim.street.trees import LEAVES, clump, garden_tree, grass, tuft
 
-# A clipped hedge stops a beam within a decimetre, as those of real scans do; a free one within two
-# or three.
+# A clipped hedge stops a beam within a decimetre, as in real scans; a free one within two or three.
 _CLIPPED_PER_M, _FREE_PER_M = (5.5, 9.5), (2.1, 5.3)
 # Openings for people and for cars.
 _PATH_M, _DRIVE_M = (0.9, 1.3), (2.7, 3.4)
-# A front garden has a plant per this many square metres, and at most so many.
+# Square metres of a front garden per plant, and its largest number of plants.
 _PLANT_M2, _MOST_PLANTS = 4.0, 20
 _TUFT_M2, _MOST_TUFTS = 8.0, 10
 _WALL_M, _PILLAR_M = 0.22, 0.4

@@ -40,7 +40,7 @@ def pram(draw: Generator) -> Body:
     look = (Semantic.UNKNOWN_OBJECT, Material.CLOTH, draw.uniform(0.08, 0.25))
     wheels_m = (0.75, 0.5, 0.25)
     return (
-        *(part._replace(centre=_moved(part.centre, -0.55)) for part in pusher),
+        *(part._replace(centre=_shift_ahead(part.centre, -0.55)) for part in pusher),
         Part((0.35, 0, 0.65), (0.8, 0.4, 0.3), *look),
         Part((0.5, 0, 0.85), (0.45, 0.42, 0.5), *look, Shape.ELLIPSOID),
         # Front and rear wheels: of a block of which a ray from the side meets only the ends.
@@ -136,5 +136,5 @@ def _luggage(draw: Generator, tall_m: float) -> list[Part]:
     return []
 
 
-def _moved(at: tuple[float, float, float], ahead_m: float) -> tuple[float, float, float]:
+def _shift_ahead(at: tuple[float, float, float], ahead_m: float) -> tuple[float, float, float]:
     return (at[0] + ahead_m, at[1], at[2])

@@ -29,7 +29,7 @@ from lidarsim.street.works import building_site, scaffolding
 
 # A drive beside a house, wide enough for a garage.
 _DRIVE_M = 4.0
-# Behind the houses stands a tree on each so many metres of street.
+# Metres of street per tree behind the houses.
 _BACK_TREE_M = 4.0
 # Trees in the front garden of a detached house, on average.
 _FRONT_TREES = 1.7

@@ -37,8 +37,8 @@ _DETAIL_M = 25.0
 _BLOCKS_PER_DISTRICT = 6
 # Weather lasts this many scans.
 _SCANS_PER_WEATHER = 100
-# Instance numbers: those of blocks repeat after 200 blocks = 4.8 km, those of actors of one kind
-# in one lane after 1000.
+# Instance numbers of blocks repeat after 200 blocks = 4.8 km, of actors of one kind in one lane
+# after 1000.
 _MAX_OBJECTS_PER_BLOCK = 256
 _STATIC_BLOCKS = 200
 _ACTORS_PER_STREAM = 1000
@@ -81,11 +81,11 @@ class Street:
         weather = self.weather_of(scan)
         course = course_of(self.seed, self.drive)
         s = course.position(scan)
-        own = math.floor(s / BLOCK_M)
+        ego_block = math.floor(s / BLOCK_M)
         primitives: list[Primitive] = []
         details: list[Primitive] = []
         puddles: list[Puddle] = []
-        for number in range(own - _BLOCKS_BEHIND, own + _BLOCKS_AHEAD + 1):
+        for number in range(ego_block - _BLOCKS_BEHIND, ego_block + _BLOCKS_AHEAD + 1):
             block = _block(self.seed, self.drive, number)
             primitives += block.primitives
             details += block.details
@@ -97,7 +97,7 @@ class Street:
         speed_m_s = course.speed_m_s(scan) * course.section(s).stretch(course.ego_lateral_m)
         here = (pose.x_m, pose.y_m)
         primitives += [p for p in details if math.dist(p.centre[:2], here) < _DETAIL_M]
-        around = range(own - _BLOCKS_BEHIND, own + _BLOCKS_AHEAD + 2)
+        around = range(ego_block - _BLOCKS_BEHIND, ego_block + _BLOCKS_AHEAD + 2)
         return Scene(
             tuple(primitives),
             pose,
@@ -176,12 +176,13 @@ def _streams(seed: int, drive: int) -> tuple[_Stream, ...]:
     draw = generator_for(seed, "streams", drive)
     streams = []
     for lane in range(course.lanes[0]):
-        own = lane == course.ego_lane
-        speed_m_s = None if own else 10 * course.step_m * draw.uniform(0.85, 1.15)
+        is_ego_lane = lane == course.ego_lane
+        speed_m_s = None if is_ego_lane else 10 * course.step_m * draw.uniform(0.85, 1.15)
         lateral = -(lane + 0.5) * course.lane_m
         streams.append(_Stream(vehicle, lateral, 1, speed_m_s, draw.uniform(*character.car_gap_m)))
     for lane in range(course.lanes[1]):
-        lateral, gap_m = (lane + 0.5) * course.lane_m, draw.uniform(*character.car_gap_m)
+        lateral = (lane + 0.5) * course.lane_m
+        gap_m = draw.uniform(*character.car_gap_m)
         streams.append(_Stream(vehicle, lateral, -1, draw.uniform(9, 15), gap_m))
     for side in (-1, 1):
         kerb = course.kerb(side)

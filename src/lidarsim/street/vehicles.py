@@ -18,9 +18,9 @@ DIRT = 0.0015
 # on them nor the inside.
 _CLEAN, _SEATS = (0.00003, 0.005), (0.00003, 0.03)
 _DARK = (0.0007, 0.02)
-# Tyres are black rubber; plastic is that of mirrors, bumpers and saddles.
+# Tyres are black rubber; mirrors, bumpers and saddles are plastic.
 _RUBBER, _PLASTIC = 0.03, 0.06
-# Clear of the ground: the sills of a car, those of vans and caravans, and its tyres' height.
+# Clear of the ground: the sills of a car, of vans and caravans, and its tyres' height.
 _SILL_M, _HIGH_SILL_M, _TYRE_M = 0.22, 0.35, 0.62
 # A corner of a bumper is round by about this much, seen from above.
 _ROUND_M = 0.35

@@ -103,9 +103,11 @@ def _mesh_fence(
     """Panels of mesh between posts, not quite in line, one of them sometimes open."""
     for s in np.arange(first + _PANEL_M / 2, last - _PANEL_M / 2 + 0.1, _PANEL_M):
         instance = builder.new_instance()
-        at, yaw_rad = (float(s), side * near_m + draw.normal(0, 0.1)), draw.normal(0, 0.05)
+        at = (float(s), side * near_m + draw.normal(0, 0.1))
+        yaw_rad = draw.normal(0, 0.05)
         if draw.random() < 0.1:
-            at, yaw_rad = (at[0], at[1] + side * 1.7), draw.choice((-1, 1)) * draw.uniform(0.5, 1.2)
+            at = (at[0], at[1] + side * 1.7)
+            yaw_rad = draw.choice((-1, 1)) * draw.uniform(0.5, 1.2)
         metal = (Semantic.FENCE, *_STEEL, instance)
         size = (_PANEL_M, _PANEL_DEEP_M, _PANEL_TALL_M - 0.15)
         builder.solid(Shape.BOX, at, size, *metal, 0.15, yaw_rad, extinction_per_m=_MESH_PER_M)
@@ -122,7 +124,8 @@ def _barriers(
 ) -> None:
     """Boards on posts along the road with cones before them."""
     for s in np.arange(first + 1.1, last - 1.0, 2.2):
-        instance, lateral = builder.new_instance(), side * near_m + draw.normal(0, 0.05)
+        instance = builder.new_instance()
+        lateral = side * near_m + draw.normal(0, 0.05)
         look = (Semantic.FENCE, *_STEEL, instance)
         board_m, at = (2.0, 0.04, _BOARD_M), (float(s), lateral)
         yaw_rad = draw.normal(0, 0.04)
@@ -163,7 +166,8 @@ def _pallets(builder: Builder, draw: Generator, s: float, lateral: float) -> Non
 
 def _container(builder: Builder, draw: Generator, s: float, lateral: float) -> None:
     """A skip, open above and full, or a site hut."""
-    instance, paint = builder.new_instance(), draw.uniform(0.08, 0.22)
+    instance = builder.new_instance()
+    paint = draw.uniform(0.08, 0.22)
     yaw_rad = draw.normal(0, 0.06)
     if draw.random() < 0.35:
         hut = (Semantic.UNKNOWN_CONSTRUCTION, Material.PAINT, paint, instance)

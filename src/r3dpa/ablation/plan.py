@@ -42,7 +42,7 @@ _PARTS_OF_SCALE = ("options", "config", "stages", "tables", "commands", "referen
 _digest = cache(sha256_of)  # tables share weights
 
 
-class Stage(NamedTuple):
+class PlannedStage(NamedTuple):
     """A training, shared by all rows in which it is the same.
 
     The name is the experiment, a hash of all that the training depends on, and the seed. ``words``
@@ -80,7 +80,7 @@ class Row(NamedTuple):
     key: str
     label: str
     published: dict[str, float]
-    stages: dict[int, list[Stage]]
+    stages: dict[int, list[PlannedStage]]
 
 
 class Table(NamedTuple):
@@ -103,13 +103,13 @@ class Plan(NamedTuple):
     tables: list[Table]
 
     @property
-    def chains(self) -> list[list[Stage]]:
+    def chains(self) -> list[list[PlannedStage]]:
         """Stages of each row and seed."""
         rows = [row for table in self.tables for row in table.rows]
         return [chain for row in rows for chain in row.stages.values()]
 
     @property
-    def stages(self) -> list[Stage]:
+    def stages(self) -> list[PlannedStage]:
         """All stages, each once, after those that they start from."""
         return list({stage.name: stage for chain in self.chains for stage in chain}.values())
 
@@ -198,7 +198,7 @@ class _Planner:
     ) -> None:
         self.out, self._scale, self._prior, self._resolve = out, scale, prior, resolve
 
-    def plan_row(self, table: str, commands: dict[str, str], where: str) -> list[Stage]:
+    def plan_row(self, table: str, commands: dict[str, str], where: str) -> list[PlannedStage]:
         """Stages of a row with seed 0, each after those that it needs."""
         every = self._scale.get("commands", {}) | commands
         places = {"out": self.out}
@@ -209,7 +209,7 @@ class _Planner:
         for name in reversed(every):
             if name in needed:
                 needed.update(_NAME.findall(every[name]))
-        stages: dict[str, Stage] = {}
+        stages: dict[str, PlannedStage] = {}
         for name, command in every.items():
             if name in needed:
                 place = f"{where}: {name}"
@@ -239,7 +239,7 @@ class _Planner:
                     added += ["--config", json.dumps(part)]
         return [experiment, *added, *options]
 
-    def _stage(self, words: list[str], before: Iterable[str], on_scans: bool) -> Stage:
+    def _stage(self, words: list[str], before: Iterable[str], on_scans: bool) -> PlannedStage:
         config = self._resolve(("fit", *words, *(_seed_words(0) if on_scans else ())))
         trained = {key: value for key, value in config.items() if key not in _NOT_TRAINED}
         # Wherever the folder is, and whether the stages in it are trained or not.
@@ -248,10 +248,12 @@ class _Planner:
         files = [_digest(path) for path in map(Path, _WEIGHTS.findall(text)) if path.is_file()]
         digest = hashlib.sha256(json.dumps([text, files]).encode()).hexdigest()[:10]
         name = f"{words[0]}-{digest}"
-        return Stage(name, self.out / "stages" / name, words, config, tuple(before), on_scans)
+        return PlannedStage(
+            name, self.out / "stages" / name, words, config, tuple(before), on_scans
+        )
 
 
-def _with_seed(chain: Sequence[Stage], seed: int, out: Path) -> list[Stage]:
+def _with_seed(chain: Sequence[PlannedStage], seed: int, out: Path) -> list[PlannedStage]:
     """The stages with another seed; those on images have none."""
     names = {s.name: f"{s.name}-seed{seed}" if s.on_scans and seed else s.name for s in chain}
     checkpoints = {
@@ -274,13 +276,13 @@ def _seed_words(seed: int) -> list[str]:
     return [word for key in _SEEDS for word in (f"--{key}", str(seed))]
 
 
-def _released_stage(path: Path, out: Path) -> Stage:
+def _released_stage(path: Path, out: Path) -> PlannedStage:
     """Stage of released weights or samples."""
     if not path.exists():
         raise ValueError(f"--released {path} does not exist")
     content = _digest(path) if path.is_file() else str(path.resolve())
     name = f"released-{hashlib.sha256(content.encode()).hexdigest()[:10]}"
-    return Stage(name, out / "stages" / name, [str(path)], {}, (), on_scans=False)
+    return PlannedStage(name, out / "stages" / name, [str(path)], {}, (), on_scans=False)
 
 
 def _read(path: Path, needed: Sequence[str], optional: Sequence[str]) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from r3dpa.ablation.plan import Plan, Stage
+from r3dpa.ablation.plan import Plan, PlannedStage
 from r3dpa.io import no_follow, only_writer, write_text
 
 _CSV_LOGGER = {
@@ -43,10 +43,10 @@ class Job(NamedTuple):
 
     @property
     def done(self) -> bool:
-        """Whether it ended well with these settings."""
+        """Whether the job has succeeded with these settings."""
         mark = self.place.with_suffix(".done")
-        made = self.makes is None or self.makes.is_file()
-        return made and mark.is_file() and mark.read_text(encoding="utf-8") == self.content
+        has_result = self.makes is None or self.makes.is_file()
+        return has_result and mark.is_file() and mark.read_text(encoding="utf-8") == self.content
 
     @property
     def log(self) -> Path:
@@ -185,14 +185,14 @@ def plan_jobs(plan: Plan) -> list[Job]:
     return jobs
 
 
-def _training_job(stage: Stage) -> Job:
+def _training_job(stage: PlannedStage) -> Job:
     needs = (*stage.before, "features") if stage.on_scans else stage.before
     words = ["fit", *_stage_words(stage), "--ckpt_path", "last"]
     words += ["--trainer.logger", json.dumps([_CSV_LOGGER])]
     return Job(stage.name, words, stage.folder / "fit", stage.name, needs)
 
 
-def _test_job(stage: Stage, reference: Path, of_reference: str) -> Job:
+def _test_job(stage: PlannedStage, reference: Path, of_reference: str) -> Job:
     words = ["test", *_stage_words(stage), "--ckpt_path", str(stage.checkpoint)]
     words += ["--scorer.reference", str(reference), "--trainer.logger", "false"]
     words += ["--trainer.devices", "1"]
@@ -203,13 +203,13 @@ def _test_job(stage: Stage, reference: Path, of_reference: str) -> Job:
     )
 
 
-def _stage_words(stage: Stage) -> list[str]:
-    own = ["--run_dir", str(stage.folder), "--trainer.enable_progress_bar", "false"]
-    return [*stage.words, *own]
+def _stage_words(stage: PlannedStage) -> list[str]:
+    options = ["--run_dir", str(stage.folder), "--trainer.enable_progress_bar", "false"]
+    return [*stage.words, *options]
 
 
 def _released_jobs(
-    stage: Stage, reference: Path, of_reference: str, scorer: dict[str, Any]
+    stage: PlannedStage, reference: Path, of_reference: str, scorer: dict[str, Any]
 ) -> list[Job]:
     """Samples of released weights, as many as of trained ones, and their comparison."""
     (given,) = stage.words

@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple
 import torch
 
 from r3dpa import viz
-from r3dpa.ablation.plan import Plan, Row, Stage, Table
+from r3dpa.ablation.plan import Plan, PlannedStage, Row, Table
 from r3dpa.io import command, machine, versions, write_text
 from r3dpa.metrics.results import (
     Evaluation,
@@ -36,7 +36,7 @@ Results = Mapping[str, Mapping[int, Evaluation]]
 class Order(NamedTuple):
     """Result for one order of the paper: ``claim`` (better, worse, alike) of two rows in a metric.
 
-    ``change`` and ``interval`` are those of :func:`relative_change`. ``holds`` is yes if the
+    ``change`` and ``interval`` come from :func:`relative_change`. ``holds`` is yes if the
     interval lies inside the claim, no if outside, else unclear.
     """
 
@@ -145,11 +145,11 @@ def _published(table: Table) -> list[Evaluation]:
 
 
 def _head(plan: Plan, table: Table) -> str:
-    intervals = "those of the scenes: another training differs by more."
+    intervals = "over the scenes: another training differs by more."
     if len(plan.seeds) > 1:
         intervals = (
-            "Student's, of the mean over the seeds, which share scans and prior; those of orders "
-            "are of the differences seed by seed."
+            "Student's, of the mean over the seeds, which share scans and prior; for orders, of "
+            "the differences seed by seed."
         )
     seeds = ", ".join(map(str, plan.seeds))
     return (
@@ -232,7 +232,7 @@ def _log_row(
 ) -> None:
     import wandb  # takes seconds
 
-    stages: list[Stage] = row.stages[seed]
+    stages: list[PlannedStage] = row.stages[seed]
     config = {
         "scale": plan.scale,
         "seed": seed,

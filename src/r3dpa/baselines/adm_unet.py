@@ -15,7 +15,7 @@ class ADMUNet(EfficientUNet):
     """U-Net of residual blocks that resample between their norm and their first convolution.
 
     Every block on the way down is concatenated to one on the way up; the lowest level and the
-    middle have attention. Arguments and ``coords`` are those of :class:`EfficientUNet`.
+    middle have attention. Arguments and ``coords`` as in :class:`EfficientUNet`.
 
     Source: Dhariwal and Nichol 2021, as in R2Flow (Nakashima et al. 2025).
     """
@@ -23,7 +23,8 @@ class ADMUNet(EfficientUNet):
     def _build(
         self, channels: int, widths: Sequence[int], counts: Sequence[int], shared: Shared
     ) -> None:
-        lowest, last = len(widths) - 1, widths[-1]
+        lowest = len(widths) - 1
+        last = widths[-1]
         self.in_conv = shared.conv(channels, widths[0])
         skips = [widths[0]]
         self.down_blocks, self.up_blocks = nn.ModuleList(), nn.ModuleList()

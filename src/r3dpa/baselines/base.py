@@ -38,7 +38,7 @@ class AveragedNetwork(nn.Module):
 
     @torch.no_grad()
     def update(self, network: nn.Module, step: int) -> None:
-        """Moves the average towards the weights after ``step``."""
+        """Move the average towards the weights after ``step``."""
         if (decay := self.decay(step)) == 1:
             return
         ours = [*self.network.parameters(), *self.network.buffers()]
@@ -50,23 +50,24 @@ class AveragedNetwork(nn.Module):
                 average.lerp_(weight.to(average.dtype), 1 - decay)
 
     def train(self, mode: bool = True) -> AveragedNetwork:
-        """Stays in evaluation mode."""
+        """Stay in evaluation mode."""
         return super().train(False)
 
 
 class Baseline(Stage):
-    """Base of the baselines.
+    """Base class of the baselines.
 
     A subclass names its ``stage`` and has its own ``training_step``. To be sampled by every
     command it has an ``interpolant`` between samples (time 0) and noise (time 1), a
-    :meth:`velocity` on it, and :meth:`decode` where samples are latents. What it needs beside
-    its networks to be rebuilt from a checkpoint is in :meth:`settings`.
+    :meth:`velocity` on it, and :meth:`decode` where samples are latents. :meth:`settings` returns
+    what else, beside the networks, rebuilds it from a checkpoint.
 
     Args:
         network: Network that is trained, from ``latent_shape`` to ``latent_shape``.
-        latent_shape: Size ``(C, h, w)`` of a sample; of a range image where :meth:`decode` is none.
+        latent_shape: Shape ``(C, h, w)`` of a sample, which is a range image unless a subclass
+            overrides :meth:`decode`.
         optimizer: Optimiser settings.
-        decay: Decay of the averaged weights by step; None: no average, and nothing to sample.
+        decay: Decay of the averaged weights by step; None for no average and no sampling.
         seed: Key of the training draws.
         time_sampling: Density of the training times.
     """
@@ -104,7 +105,7 @@ class Baseline(Stage):
         raise NotImplementedError
 
     def trainable(self) -> dict[str, nn.Module]:
-        """Networks that it trains, by name."""
+        """Trained networks by name."""
         return {"network": self.network}
 
     def complete(
@@ -126,7 +127,7 @@ class Baseline(Stage):
     # Starting and optimisation
 
     def setup(self, stage: str) -> None:
-        """Checks the data, and gives a network with ``coords`` the ray angles of their pixels."""
+        """Check the data, and give a network with ``coords`` the ray angles of their pixels."""
         _, geometry = self.attach_scans()
         sensor = geometry.projection.sensor
         wanted = (geometry.codec.channels, sensor.beams, sensor.columns)
@@ -144,7 +145,7 @@ class Baseline(Stage):
         return self.latent_shape
 
     def optimizer_step(self, *args: Any, **kwargs: Any) -> None:
-        """Steps the optimiser, then the average, unless the step was skipped."""
+        """Step the optimiser, then the average, unless the step was skipped."""
         step = self.global_step
         super().optimizer_step(*args, **kwargs)
         if self.ema is not None and not self.step_skipped:
@@ -159,7 +160,7 @@ class Baseline(Stage):
     # Evaluation
 
     def validation_step(self, batch: LidarBatch, batch_idx: int) -> None:
-        """Adds the training loss of the averaged network on held-out scans to the means."""
+        """Add the training loss of the averaged network on held-out scans to the means."""
         draws = self.draw_held_out(batch["index"])
         data = self.encode(batch["range_image"])
         noise = batch.get("noise", draws.noise)
@@ -175,6 +176,6 @@ class Baseline(Stage):
         return BaselineGenerator(self, self.ema.network, self.scan_geometry, sampler, precision)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Adds the settings that sampling needs."""
+        """Add the settings that sampling needs."""
         super().on_save_checkpoint(checkpoint)
         checkpoint["r3dpa"]["settings"] = self.settings()

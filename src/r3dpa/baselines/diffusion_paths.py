@@ -122,7 +122,8 @@ class StepPath(DiffusionPath):
 
     def log_snr(self, time: Tensor) -> Tensor:
         """Log signal-to-noise ratio at times in [0, 1] of any shape."""
-        step, table = self.step_of(time), self.signal.logit().to(time.device)
+        step = self.step_of(time)
+        table = self.signal.logit().to(time.device)
         low = step.floor().long().clamp(max=self.num_steps - 2)
         return torch.lerp(table[low], table[low + 1], (step - low).double()).to(time.dtype)
 
@@ -143,7 +144,7 @@ def repaint(
     resamplings: int = 1,
     jump: int = 1,
 ) -> Tensor:
-    """Completes samples whose values are known where the mask is 1.
+    """Complete samples whose values are known where the mask is 1.
 
     Each interval of time is crossed ``resamplings`` times by ancestral steps, with steps back to
     its start between, so that unknown values come to fit the known ones. The last interval is
@@ -176,8 +177,8 @@ def repaint(
             for here, there in pairwise(times):
                 noised = path.interpolate(known, next(draws), there)
                 data = path.denoise(velocity(x, here), x, here)
-                made = ancestral_step(data, x, here, there, next(draws), interpolant=path)
-                x = mask * noised + (1 - mask) * made
+                generated = ancestral_step(data, x, here, there, next(draws), interpolant=path)
+                x = mask * noised + (1 - mask) * generated
             if index == steps - 1 or crossing == resamplings - 1:
                 break
             for here, there in pairwise(reversed(times)):

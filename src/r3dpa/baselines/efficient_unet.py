@@ -34,7 +34,7 @@ class Shared(NamedTuple):
 
 
 class EfficientUNet(nn.Module):
-    """U-Net of R2DM; that of R2Flow is the same with times of a flow.
+    """U-Net of R2DM, and of R2Flow with times of a flow.
 
     Four levels, each half the size of the one before, with attention at the lowest. Columns wrap
     around, rows are padded with zeros.
@@ -51,12 +51,12 @@ class EfficientUNet(nn.Module):
         gn_num_groups: Groups of the group norms.
         gn_eps: Added to their variances.
         attn_num_heads: Heads of the attention.
-        coords_encoding: How the ray angles enter, see :func:`encode_angles`; None: not at all.
+        coords_encoding: Encoding of the ray angles, see :func:`encode_angles`; None for no angles.
         ring: Wrap columns around; else they are padded with zeros as well.
 
     Attributes:
-        coords: ``(1, 2, H, W)`` inclination and azimuth of the rays, radians; those of the upper
-            left pixel corners of an HDL-64E, until other weights or data set them.
+        coords: ``(1, 2, H, W)`` inclination and azimuth of the rays, radians; rays through the
+            upper left pixel corners of an HDL-64E, until other weights or data set them.
     """
 
     coords: Tensor
@@ -104,11 +104,14 @@ class EfficientUNet(nn.Module):
         c = [base, *widths]
         self.in_conv: nn.Module = shared.conv(channels, base)
         self.down = nn.ModuleList(
-            Block(c[i], c[i + 1], counts[i], shared, i == last, down=i > 0) for i in range(_LEVELS)
+            ResolutionLevel(c[i], c[i + 1], counts[i], shared, i == last, down=i > 0)
+            for i in range(_LEVELS)
         )
         # Deepest first; the skip of its own level joins every block but that.
         self.up = nn.ModuleList(
-            Block(c[i + 1] * (1 + (i < last)), c[i], counts[i], shared, i == last, up=i > 0)
+            ResolutionLevel(
+                c[i + 1] * (1 + (i < last)), c[i], counts[i], shared, i == last, up=i > 0
+            )
             for i in reversed(range(_LEVELS))
         )
         self.out_conv: nn.Module = zeroed(shared.conv(base, self.in_channels))
@@ -142,8 +145,8 @@ class Blocks(nn.ModuleList):
         return hidden
 
 
-class Block(nn.Module):
-    """A level: step down, residual blocks, attention, step up; those that it has."""
+class ResolutionLevel(nn.Module):
+    """A level: step down, residual blocks, attention, step up; all but the blocks are optional."""
 
     def __init__(
         self,
@@ -269,7 +272,7 @@ class Resample(nn.Module):
 def sinusoid(time: Tensor, width: int, max_period: float = 10_000.0) -> Tensor:
     """Features ``(B, width)`` of times ``(B,)``: sines, then cosines.
 
-    Frequencies fall from 1 to exactly ``1 / max_period``, unlike those of
+    Frequencies fall from 1 to exactly ``1 / max_period``, unlike in
     :func:`r3dpa.nn.velocity_network.time_frequencies`.
     """
     half = width // 2
@@ -285,7 +288,7 @@ def corner_angles(projection: Projection) -> Tensor:
 
 
 def hdl64e_angles(size: Size) -> Tensor:
-    """The same of the sensor that R2DM assumes, for images ``(H, W)``."""
+    """Corner angles of the HDL-64E as R2DM assumes it, for images ``(H, W)``."""
     return corner_angles(SphericalProjection(LidarSensor(*size)))
 
 
@@ -313,10 +316,11 @@ def encode_angles(angles: Tensor, encoding: Encoding | None, size: Size) -> Tens
 def spherical_harmonics(angles: Tensor) -> Tensor:
     """Real spherical harmonics ``(1, 25, H, W)`` of degrees 0 to 4 in the direction of the rays.
 
-    Orders of a degree run from -l to l. The y axis is that of the official code, to the right.
+    Orders of a degree run from -l to l. The y axis points to the right, as in the official code.
     """
-    sine, azimuth = angles[:, 0].double().sin(), -angles[:, 1].double()
-    found = []
+    sine = angles[:, 0].double().sin()
+    azimuth = -angles[:, 1].double()
+    harmonics = []
     for degree in range(5):
         for order in range(-degree, degree + 1):
             m = abs(order)
@@ -328,5 +332,5 @@ def spherical_harmonics(angles: Tensor) -> Tensor:
             factor = (2 - (m == 0)) * (2 * degree + 1) / (4 * math.pi)
             factor *= math.factorial(degree - m) / math.factorial(degree + m)
             wave = (m * azimuth).sin() if order < 0 else (m * azimuth).cos()
-            found.append(math.sqrt(factor) * legendre * wave)
-    return torch.stack(found, dim=1).to(angles.dtype)
+            harmonics.append(math.sqrt(factor) * legendre * wave)
+    return torch.stack(harmonics, dim=1).to(angles.dtype)

@@ -23,7 +23,7 @@ class BaselineGenerator:
     """Draws scenes from a baseline.
 
     The random numbers of a scene are a function of (seed, index) alone and are drawn on the CPU,
-    as those of :class:`r3dpa.SceneGenerator` are.
+    as in :class:`r3dpa.SceneGenerator`.
 
     Args:
         baseline: Module that knows path, velocity and decoder, see
@@ -61,25 +61,25 @@ class BaselineGenerator:
         return next(self.network.parameters()).device
 
     def with_sampler(self, sampler: SamplerConfig) -> BaselineGenerator:
-        """The same network with another solver; both may be used."""
+        """Return a generator of the same network with another solver."""
         other = copy.copy(self)
         other.sampler = sampler
         return other
 
     def prepare(self) -> None:
-        """Nothing: the first scene costs what the others do."""
+        """Do nothing: the first scene takes as long as the others."""
 
     def velocity(self, x: Tensor, time: Tensor) -> Tensor:
         """Velocity ``(B, C, h, w)`` at times ``(B,)``, in the dtype of ``x``."""
         self.calls += 1
         half = self.precision == "bf16"
         with torch.autocast(x.device.type, torch.bfloat16, enabled=half):
-            found = self.baseline.velocity(self._called, x.float(), time.float())
-        return found.to(x.dtype)
+            velocity = self.baseline.velocity(self._called, x.float(), time.float())
+        return velocity.to(x.dtype)
 
     @torch.inference_mode()
     def generate(self, indices: int | Sequence[int], seed: int = 0) -> SceneBatch:
-        """Draws one scene per index; arguments as of :meth:`r3dpa.SceneGenerator.generate`."""
+        """Draw one scene per index; arguments as of :meth:`r3dpa.SceneGenerator.generate`."""
         indices = scene_indices(indices)
         size = self.batch_size or len(indices)
         if len(indices) > size:
@@ -114,21 +114,22 @@ class BaselineGenerator:
         *,
         resamplings: int = 10,
     ) -> SceneBatch:
-        """Completes an encoded range image ``(C, H, W)``, once per index.
+        """Complete an encoded range image ``(C, H, W)``, once per index.
 
-        Pixels that are True in ``known`` ``(H, W)`` are kept. ``resamplings`` is that of
-        :func:`~r3dpa.baselines.diffusion_paths.repaint`, the steps are those of the sampler.
-        Latents are completed without resampling, see
-        :func:`~r3dpa.baselines.diffusion_paths.inpaint`.
+        Pixels that are True in ``known`` ``(H, W)`` are kept. ``resamplings`` goes to
+        :func:`~r3dpa.baselines.diffusion_paths.repaint`, with the steps of the sampler. Latents
+        are completed without resampling, see :func:`~r3dpa.baselines.diffusion_paths.inpaint`.
         """
-        self.calls, baseline, indices = 0, self.baseline, scene_indices(indices)
+        self.calls = 0
+        baseline = self.baseline
+        indices = scene_indices(indices)
         noises = scene_noise(baseline.latent_shape, indices, seed)
         draws = (noise.to(self.device) for noise in noises)
         data = baseline.encode(image.to(self.device)[None]).expand(len(indices), -1, -1, -1)
         # A latent pixel is known where all of its pixels are.
         mask = -F.adaptive_max_pool2d(-known[None, None].to(data), data.shape[-2:])
-        found = baseline.complete(self.velocity, data, mask, draws, self.sampler, resamplings)
-        return self._scenes(found)
+        samples = baseline.complete(self.velocity, data, mask, draws, self.sampler, resamplings)
+        return self._scenes(samples)
 
     def noise(self, indices: Sequence[int], seed: int = 0) -> Tensor:
         """First noise ``(B, C, h, w)`` of scenes, on the device of the network."""

@@ -1,7 +1,7 @@
 """HDiT, the hourglass transformer of R2Flow: neighbourhood attention, global in the middle.
 
 Letters: B batch, C channels, H x W image, h x w tokens of a level, D token width, E width of the
-time embedding. Module names are those of the official state dict.
+time embedding. Module names as in the official state dict.
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ class _RmsNorm(nn.Module):
         self.scale = nn.Parameter(torch.ones(width))
 
     def forward(self, tokens: Tensor) -> Tensor:
-        return (_rms_normalised(tokens) * self.scale).to(tokens.dtype)
+        return (_normalise_rms(tokens) * self.scale).to(tokens.dtype)
 
 
 class _TimedRmsNorm(nn.Module):
@@ -151,7 +151,7 @@ class _TimedRmsNorm(nn.Module):
         self.proj = nn.Sequential(zeroed(_linear(embedding, width)), Rearrange("B D -> B 1 1 D"))
 
     def forward(self, tokens: Tensor, embedding: Tensor) -> Tensor:
-        return _rms_normalised(tokens).to(tokens.dtype) * (1 + self.proj(embedding))
+        return _normalise_rms(tokens).to(tokens.dtype) * (1 + self.proj(embedding))
 
 
 class _LearnedPositions(nn.Module):
@@ -250,7 +250,7 @@ class _RotaryEmbedding(nn.Module):
         return torch.cat(rotated, dim=-1).to(vectors.dtype)
 
 
-class _Attention(nn.Module):
+class _CosineAttention(nn.Module):
     """Attention by the cosine of rotated queries and keys, in a window or between all tokens."""
 
     def __init__(
@@ -288,13 +288,16 @@ class _Attention(nn.Module):
 
 
 def _blocks(depth: int, attention: tuple[Any, ...], feed_forward: tuple[Any, ...]) -> Blocks:
-    return Blocks(_Block(attention, feed_forward) for _ in range(depth))
+    return Blocks(_TokenBlock(attention, feed_forward) for _ in range(depth))
 
 
-class _Block(nn.Module):
+class _TokenBlock(nn.Module):
     def __init__(self, attention: tuple[Any, ...], feed_forward: tuple[Any, ...]) -> None:
         super().__init__()
-        self.residual_attn, self.residual_ffn = _Attention(*attention), _FeedForward(*feed_forward)
+        self.residual_attn, self.residual_ffn = (
+            _CosineAttention(*attention),
+            _FeedForward(*feed_forward),
+        )
 
     def forward(self, tokens: Tensor, angles: Tensor, embedding: Tensor) -> Tensor:
         return self.residual_ffn(self.residual_attn(tokens, angles, embedding), embedding)
@@ -313,6 +316,6 @@ class _Expand(nn.Module):
         return torch.lerp(skipped, fine.to(skipped.dtype), self.alpha.sigmoid().to(skipped.dtype))
 
 
-def _rms_normalised(tokens: Tensor) -> Tensor:
+def _normalise_rms(tokens: Tensor) -> Tensor:
     values = at_least_float32(tokens)
     return F.rms_norm(values, values.shape[-1:], eps=1e-6)

@@ -39,7 +39,7 @@ class ReleasedDDIM(SamplerConfig):
         draws: torch.Generator | Iterable[Tensor],
         interpolant: Interpolant,
     ) -> Tensor:
-        """As :meth:`SamplerConfig.solve`; the number of steps is that of the list."""
+        """Solve as :meth:`SamplerConfig.solve` does; the list determines the number of steps."""
         times = released_times(self.steps)
         eta = self.eta if self.solver == "ddpm" else 0.0
         return ancestral(velocity, noise, times, draws, eta=eta, interpolant=interpolant)
@@ -121,7 +121,7 @@ class LiDM(Baseline):
         return self.first_stage.in_channels, rows * stride[0], columns * stride[1]
 
     def on_fit_start(self) -> None:
-        """Loads the first stage, unless this run goes on from a checkpoint of its own."""
+        """Load the first stage, unless this run resumes from a checkpoint."""
         if self.loaded_step:
             return
         if self.init_from is None:
@@ -135,7 +135,7 @@ class LiDM(Baseline):
         load_into({name: self.first_stage}, before, self.stage)
 
     def train(self, mode: bool = True) -> LiDM:
-        """Leaves the first stage in evaluation mode."""
+        """Keep the first stage in evaluation mode."""
         super().train(mode)
         self.first_stage.eval()
         return self
@@ -158,7 +158,7 @@ class LiDM(Baseline):
         sampler: SamplerConfig,
         resamplings: int,
     ) -> Tensor:
-        """Completes latents by :func:`inpaint`, as released: without resampling."""
+        """Complete latents by :func:`inpaint`, as released: without resampling."""
         times = released_times(sampler.steps)
         return inpaint(velocity, next(draws), known, mask, times, draws, self.interpolant)
 

@@ -23,7 +23,7 @@ class LiDMFirstStage(Baseline):
 
     Loss: mean of l1 and, where they have a factor, errors of the empty pixels and of x and y of the
     points; codebook; and a patch discriminator, weighed so that its gradient at the last layer is
-    ``adversarial`` times that of the mean.
+    ``adversarial`` times as long as the gradient of the mean.
 
     Source: Ran et al. (CVPR 2024), with the released configuration as default.
 
@@ -32,9 +32,9 @@ class LiDMFirstStage(Baseline):
         discriminator: Of images, with points of three channels.
         mask_factor: Weight of the second output, which needs ``network.mask``.
         geometry_factor: Weight of the squared distance of points seen from above.
-        adversarial: Gradient of the discriminator over that of the reconstruction.
+        adversarial: Ratio of gradient norms, discriminator to reconstruction.
         adversarial_start: Step at which the discriminator begins.
-        released_start: It ends after that step instead, as in the released code.
+        released_start: End the discriminator after that step instead, as in the released code.
         released_geometry: Read ranges from images that are mapped to [0, 1] twice, as in the
             released code, in which empty pixels are at 6.6 m.
         curve_length: Columns that are averaged before points are compared.
@@ -157,11 +157,11 @@ class LiDMFirstStage(Baseline):
         return self.log_loss(torch.stack(list(parts.values())).sum())
 
     def validation_step(self, batch: LidarBatch, batch_idx: int) -> None:
-        """Adds the absolute error of held-out scans through the codebook to the means."""
+        """Add the absolute error of held-out scans through the codebook to the means."""
         image = batch["range_image"]
-        found = self.network.decode(self.network.encode(image).mean)
+        decoded = self.network.decode(self.network.encode(image).mean)
         self.held_out.update(
-            batch["index"], reconstruction=(found - image).abs().flatten(1).mean(1)
+            batch["index"], reconstruction=(decoded - image).abs().flatten(1).mean(1)
         )
 
     test_step = validation_step

@@ -1,7 +1,7 @@
 """Networks of LiDM: vector-quantised autoencoder, discriminators, U-Net without alignment.
 
-Encoder, decoder and U-Net are those of R3DPA, which took them from LiDM. Letters: B batch, C latent
-channels, H x W image size, h x w latent size.
+Encoder, decoder and U-Net are the same as in R3DPA, which took them from LiDM. Letters: B batch,
+C latent channels, H x W image size, h x w latent size.
 """
 
 from __future__ import annotations
@@ -50,7 +50,8 @@ class Codebook(nn.Module):
     def forward(self, latents: Tensor) -> Quantised:
         """Nearest codes of ``(B, C, h, w)``; gradients pass through as if nothing had changed."""
         latents = at_least_float32(latents)
-        codes, pixels = self.embedding.weight, latents.movedim(1, -1)
+        codes = self.embedding.weight
+        pixels = latents.movedim(1, -1)
         with no_autocast(latents.device):
             products = pixels @ codes.T
         distance = pixels.square().sum(-1, keepdim=True) + codes.square().sum(1) - 2 * products
@@ -66,10 +67,10 @@ class Codebook(nn.Module):
 class VQAutoencoder(VAE):
     """First stage of LiDM, whose latents are quantised when they are decoded.
 
-    The diffusion model works on them before that. With ``mask`` the decoder has a second output,
-    below 0 where a pixel is empty.
+    The diffusion model works on latents before quantisation. With ``mask`` the decoder has a
+    second output, below 0 where a pixel is empty.
 
-    Source: Ran et al. (CVPR 2024). State-dict keys are those of the released checkpoints.
+    Source: Ran et al. (CVPR 2024). State-dict keys as in the released checkpoints.
 
     Args:
         num_codes: Vectors of the codebook.

@@ -13,7 +13,7 @@ from r3dpa.checkpoints.networks import Checkpoint, NetworkState
 from r3dpa.checkpoints.official import PROJECTION, unet_sizes, vae_sizes, whole_stride
 
 _MARK = "quantize.embedding.weight"
-#: Official keys -> network; the names inside are ours, those of the average have no dots.
+#: Official keys -> network; the names inside are ours, without dots in the average.
 _TABLE: tuple[tuple[str, str | None], ...] = (
     (r"model\.diffusion_model\.(.+)", "network"),
     (r"model_ema\.diffusion_model(.+)", "ema_network"),
@@ -46,12 +46,12 @@ def from_lidm(
         path: Of the file.
         encoding: ``linear`` for the networks ``*_wo_logscale``; ``log2`` where None.
     """
-    found: dict[str, dict[str, Tensor]] = {}
+    weights: dict[str, dict[str, Tensor]] = {}
     for key, value in content["state_dict"].items():
         match, name = _looked_up(key)
         if name is not None:
-            found.setdefault(name, {})[match[1]] = value
-    first = found.get("first_stage") or found["network"]
+            weights.setdefault(name, {})[match[1]] = value
+    first = weights.get("first_stage") or weights["network"]
     sizes = vae_sizes(first) | {
         "num_codes": len(first[_MARK]),
         "latent_channels": first["post_quant_conv.weight"].shape[1],
@@ -59,15 +59,16 @@ def from_lidm(
         "mask": len(first["decoder.conv_out.weight"]) == 2,
     }
     networks, settings = {}, {}
-    if "first_stage" in found:
-        unet, average = found["network"], found["ema_network"]
+    if "first_stage" in weights:
+        unet, average = weights["network"], weights["ema_network"]
         ours = {key.replace(".", ""): key for key in unet}
-        found["ema_network"] = {ours.get(key, key): value for key, value in average.items()}
-        sensor, stride = PROJECTION["sensor"], whole_stride(sizes["strides"])
+        weights["ema_network"] = {ours.get(key, key): value for key, value in average.items()}
+        sensor = PROJECTION["sensor"]
+        stride = whole_stride(sizes["strides"])
         size = [sensor["beams"] // stride[0], sensor["columns"] // stride[1]]
         arguments = unet_sizes(unet) | {"input_size": size, "position_bias": "ape.bias" in unet}
         for name in ("network", "ema_network"):
-            networks[name] = _state("LiDMUNet", arguments, found[name], name)
+            networks[name] = _state("LiDMUNet", arguments, weights[name], name)
         betas = content["state_dict"]["betas"]
         settings = {"first_beta": betas[0].item(), "last_beta": betas[-1].item()}
     name = "first_stage" if networks else "network"

@@ -53,28 +53,33 @@ def neighbourhood_attention(
     for row in range(dilation[0]):
         for column in range(dilation[1]):
             part = slice(None), slice(row, None, dilation[0]), slice(column, None, dilation[1])
-            found = _undilated(query[part], key[part], value[part], kernel_size, wrap_columns)
+            attended = _attend_without_dilation(
+                query[part], key[part], value[part], kernel_size, wrap_columns
+            )
             if dilation == (1, 1):
-                return found
-            result[part] = found
+                return attended
+            result[part] = attended
     return result
 
 
-def _undilated(query: Tensor, key: Tensor, value: Tensor, kernel: Size, wrap: bool) -> Tensor:
+def _attend_without_dilation(
+    query: Tensor, key: Tensor, value: Tensor, kernel: Size, wrap: bool
+) -> Tensor:
     height, width = query.shape[1:3]
-    device, block = query.device, min(_BLOCK, query.shape[2])
+    device = query.device
+    block = min(_BLOCK, query.shape[2])
     rows = _starts(torch.arange(height, device=device), kernel[0], height)
     rows = rows[:, None] + torch.arange(kernel[0], device=device)
 
     first = torch.arange(0, width, block, device=device)
-    own = first[:, None] + torch.arange(block, device=device)  # the last block may be too long
+    columns = first[:, None] + torch.arange(block, device=device)  # the last block may be too long
     span = block + kernel[1] - 1
     if wrap:
-        start = own - kernel[1] // 2
+        start = columns - kernel[1] // 2
         shared = first[:, None] - kernel[1] // 2 + torch.arange(span, device=device)
     else:
         span = min(span, width)
-        start = _starts(own, kernel[1], width)
+        start = _starts(columns, kernel[1], width)
         shared = start[:, :1].clamp(max=width - span) + torch.arange(span, device=device)
     within = shared[:, None] - start[..., None]
     mask = ((within >= 0) & (within < kernel[1])).repeat(1, 1, kernel[0])
@@ -91,7 +96,7 @@ def _undilated(query: Tensor, key: Tensor, value: Tensor, kernel: Size, wrap: bo
         )
 
     blocks = rearrange(query, "B H W head D -> (B head H) W D")
-    blocks = F.pad(blocks, (0, 0, 0, own.numel() - width)).unflatten(1, own.shape)
+    blocks = F.pad(blocks, (0, 0, 0, columns.numel() - width)).unflatten(1, columns.shape)
     mixed = F.scaled_dot_product_attention(
         blocks, windows(key), windows(value), attn_mask=mask, scale=1.0
     )

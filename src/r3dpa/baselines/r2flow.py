@@ -23,7 +23,7 @@ class R2Flow(Baseline):
 
     Trained on scans it is the 1-rectified flow. Trained on pairs of noise and the scene that a
     trained flow makes of it, see :class:`r3dpa.baselines.ReflowPairs`, it becomes straighter
-    (2-rectified flow); with ``num_steps`` it learns the velocities at the times of that many Euler
+    (2-rectified flow); with ``num_steps`` it learns the velocities at the times of these Euler
     steps alone (timestep distillation).
 
     Source: Nakashima et al., "Fast LiDAR Data Generation with Rectified Flows" (ICRA 2025).
@@ -32,8 +32,8 @@ class R2Flow(Baseline):
         network: :class:`~r3dpa.baselines.HDiT`, :class:`~r3dpa.baselines.ADMUNet` or
             :class:`~r3dpa.baselines.EfficientUNet`.
         norm: Error of the velocity, see :func:`sample_errors`.
-        num_steps: Euler steps to distil to; None: all times.
-        init_from: Checkpoint of the flow before, whose averaged weights training starts from.
+        num_steps: Euler steps to distil to; None trains all times.
+        init_from: Checkpoint of the previous flow; training starts from its averaged weights.
         optimizer: Optimiser settings.
         time_sampling: Density of the training times; ``u_shaped`` for pairs.
         ema_decay: Decay of the averaged weights.
@@ -78,7 +78,7 @@ class R2Flow(Baseline):
         return {"num_steps": self.num_steps}
 
     def on_fit_start(self) -> None:
-        """Loads the flow before, unless this run goes on from a checkpoint of its own."""
+        """Load the previous flow, unless this run resumes from a checkpoint."""
         if self.init_from is not None and not self.loaded_step:
             load_into({"ema_network": self.network}, read_checkpoint(self.init_from), self.stage)
             self.ema.network.load_state_dict(self.network.state_dict())

@@ -22,9 +22,9 @@ StateDict = Mapping[str, Tensor]
 
 #: Names of the U-Nets of R2DM and R2Flow: official pattern, ours.
 _UNETS = (
-    (r"^d_block(\d)\.", lambda found: f"down.{int(found[1]) - 1}."),
-    (r"^u_block(\d)\.", lambda found: f"up.{4 - int(found[1])}."),
-    (r"^time_embedding\.(\d)", lambda found: f"time_embedding.{int(found[1]) - 1}"),
+    (r"^d_block(\d)\.", lambda match: f"down.{int(match[1]) - 1}."),
+    (r"^u_block(\d)\.", lambda match: f"up.{4 - int(match[1])}."),
+    (r"^time_embedding\.(\d)", lambda match: f"time_embedding.{int(match[1]) - 1}"),
     (r"\.residual_blocks\.", ".blocks."),
     (r"\.skip_conv\.", ".skip."),
     (r"\.norm2\.proj\.1\.", ".modulation."),
@@ -92,11 +92,11 @@ def from_r2dm(content: Mapping[str, Any], path: Path) -> Checkpoint:
     """Checkpoint of R2DM, such as ``r2dm-h-kitti360-300k.pth``: both U-Nets and the settings."""
     options = content["cfg"]
     model, diffusion, data = options["model"], options["diffusion"], options["data"]
-    found = model["architecture"], diffusion["timestep_type"], diffusion["noise_schedule"]
-    if found[:2] != ("efficient_unet", "continuous") or found[2] not in ("cosine", "linear"):
+    design = model["architecture"], diffusion["timestep_type"], diffusion["noise_schedule"]
+    if design[:2] != ("efficient_unet", "continuous") or design[2] not in ("cosine", "linear"):
         raise ValueError(
             "only an efficient_unet with continuous time and a cosine or linear schedule is read, "
-            f"found {', '.join(map(str, found))}"
+            f"found {', '.join(map(str, design))}"
         )
     init_args = {name: _plain(model[name]) for name in ("base_channels", *_UNET_ARGUMENTS)}
     init_args["in_channels"] = int(data["train_depth"]) + int(data["train_reflectance"])
@@ -159,7 +159,7 @@ def from_r2flow(content: Mapping[str, Any], path: Path) -> Checkpoint:
             f"only the networks {', '.join(_R2FLOW_NETWORKS)} of images in "
             f"{', '.join(_R2FLOW_FORMATS)} are read, found {architecture}, {depth_format}"
         )
-    weights = time_reversed(content["weights"])
+    weights = reverse_time(content["weights"])
     init_args: dict[str, Any] = {
         "in_channels": 1 + int(data["train_reflectance"]),
         "resolution": _plain(data["resolution"]),
@@ -192,12 +192,12 @@ def from_r2flow(content: Mapping[str, Any], path: Path) -> Checkpoint:
     )
 
 
-def time_reversed(weights: StateDict) -> dict[str, Tensor]:
+def reverse_time(weights: StateDict) -> dict[str, Tensor]:
     """Weights of a network of R2Flow whose time runs the other way; its own inverse.
 
     The official time runs from 0 (noise) to 1 (data), ours from the data, and the velocity points
     to the noise: in terms of the official ``v`` it is ``-v(x, 1 - t)``. All networks take the time
-    as cosines and sines, and those of ``w (1 - t)`` are sums of those of ``w t``: a reflection of
+    as cosines and sines. Both of ``w (1 - t)`` are linear in both of ``w t``, so a reflection of
     the columns of the first linear layer and the sign of the last layer translate the weights.
     Gradients by the weights are translated alike, as the map is orthogonal.
 
@@ -207,17 +207,17 @@ def time_reversed(weights: StateDict) -> dict[str, Tensor]:
     turned = {key: -weights[key] for key in _OUTPUTS if key in weights}
     if (key := "timestep_pe.0.linear.weight") in weights:
         angles = 2 * math.pi * weights["timestep_pe.0.freqs"].double()
-        turned[key] = _reflected(weights[key], angles)
+        turned[key] = _reflect_time(weights[key], angles)
     if (key := "time_embedding.1.weight") in weights:
         half = weights[key].shape[1] // 2
         exponents = torch.arange(half, dtype=torch.float64) / (half - 1)
         angles = torch.exp(-math.log(_MAX_PERIOD) * exponents)
         sines_last = weights[key].roll(half, dims=1)
-        turned[key] = _reflected(sines_last, angles).roll(half, dims=1)
+        turned[key] = _reflect_time(sines_last, angles).roll(half, dims=1)
     return dict(weights) | turned
 
 
-def _reflected(weight: Tensor, angles: Tensor) -> Tensor:
+def _reflect_time(weight: Tensor, angles: Tensor) -> Tensor:
     """Weight ``(E, 2K)`` for features of time t instead of 1 - t, cosines before sines.
 
     ``cos(w - w t) = cos(w) cos(w t) + sin(w) sin(w t)``, and with ``sin(w - w t)``

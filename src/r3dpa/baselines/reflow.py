@@ -40,16 +40,15 @@ class Pair:
 
     @property
     def cache_key(self) -> ItemKey:
-        """A pair follows from its number, there is no file that could change."""
+        """Key of the cache: the name alone, as a pair has no file that could change."""
         return self.name, 0, 0
 
 
 class ReflowPairs(LoaderModule):
     """Scenes of a trained flow with the noise that each was made of, as training data.
 
-    Scenes that are missing are generated before training, a share by each process; runs with the
-    same checkpoint and sampler use the same. The noise of a pair follows from its number and is
-    not kept.
+    Missing scenes are generated before training, by all processes; runs with the same checkpoint
+    and sampler share them. The noise of a pair is recomputed from its number.
 
     Args:
         root: Folder of the scenes: 524 kB each at 2 x 64 x 1024.
@@ -58,7 +57,7 @@ class ReflowPairs(LoaderModule):
         sampler: Solver and steps. Official: dopri5 with a tolerance of 1e-5, about 160 evaluations.
         num_held_out: Pairs, the last ones, for validation and test alone.
         generation_batch: Scenes that are generated together.
-        device: Where they are generated: ``cpu``, ``auto``, or ``cuda`` for that of the process.
+        device: Where to generate them: ``cpu``, ``auto``, or ``cuda`` for the process's device.
         batch_size: Pairs per batch and process.
         num_workers: Loader processes per training process.
         seed: Seed of the order of training; the pairs do not depend on it.
@@ -88,9 +87,9 @@ class ReflowPairs(LoaderModule):
         self.generation_batch, self.device = generation_batch, device
 
     def setup(self, stage: str) -> None:
-        """Generates the scenes that are missing, and opens the cache."""
+        """Generate the scenes that are missing, and open the cache."""
         store, pairs = self._store()
-        images = fill_cache(self.trainer, store, pairs, self._generated)
+        images = fill_cache(self.trainer, store, pairs, self._generate_images)
         split = len(pairs) - self.num_held_out
         self.train_set = PairDataset(pairs[:split], images)
         self.val_set = PairDataset(pairs[split:], images)
@@ -105,14 +104,14 @@ class ReflowPairs(LoaderModule):
 
     test_dataloader = val_dataloader
 
-    def _generated(self, pairs: list[Pair]) -> Iterator[Tensor]:
+    def _generate_images(self, pairs: list[Pair]) -> Iterator[Tensor]:
         """Images ``(B, C, H, W)`` of pairs, in order."""
         checkpoint = read_checkpoint(self.checkpoint)
         generator = baseline_generator(checkpoint, self.sampler, device=self.device)
         parts = range(0, len(pairs), self.generation_batch)
         for first in tqdm(parts, "generate", unit="batch", disable=None):
             numbers = [pair.number for pair in pairs[first : first + self.generation_batch]]
-            yield as_scanned(generator.generate(numbers).latents, generator.geometry)
+            yield clamp_to_sensor(generator.generate(numbers).latents, generator.geometry)
 
     def _store(self) -> tuple[Store, list[Pair]]:
         checkpoint = read_checkpoint(self.checkpoint)
@@ -149,7 +148,7 @@ class PairDataset(Dataset[dict[str, Any]]):
         return {"range_image": image, "noise": noise, "index": index, "name": pair.name}
 
 
-def as_scanned(samples: Tensor, geometry: ScanGeometry) -> Tensor:
+def clamp_to_sensor(samples: Tensor, geometry: ScanGeometry) -> Tensor:
     """Samples ``(B, C, H, W)`` as images of a scan: clamped, empty out of the sensor's range.
 
     The official pairs pass through files of metric depth, which does the same.

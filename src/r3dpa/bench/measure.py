@@ -43,7 +43,7 @@ class Ratio:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class PairedTimings:
     """Seconds of cases measured together, by round, and the first of them over itself (A/A)."""
 
     seconds: dict[str, list[float]]
@@ -55,7 +55,7 @@ class Comparison:
         return self.repeat.low <= 1 <= self.repeat.high
 
     def over_first(self, name: str) -> Ratio:
-        """Time of a case over that of the first."""
+        """Time of a case over the time of the first case."""
         return Ratio.of(self.seconds[name], next(iter(self.seconds.values())))
 
 
@@ -63,7 +63,7 @@ def compare(
     cases: Mapping[str, Callable[[], float]],
     rounds: int,
     keep: Callable[[int, Callable[[], list[float]]], list[float]] = lambda number, run: run(),
-) -> Comparison:
+) -> PairedTimings:
     """Run each case once per round, the first one twice, after a warm-up round.
 
     Every second round runs backwards, so that drifts of the machine affect all cases alike.
@@ -84,7 +84,7 @@ def compare(
     numbers = tqdm(range(1, rounds + 1), "timing", unit="round", disable=None)
     taken = [keep(number, partial(run, number)) for number in numbers]
     *seconds, again = (list(column) for column in zip(*taken, strict=True))
-    return Comparison(dict(zip(cases, seconds, strict=True)), Ratio.of(again, seconds[0]))
+    return PairedTimings(dict(zip(cases, seconds, strict=True)), Ratio.of(again, seconds[0]))
 
 
 def timed(function: Callable[[], object], device: torch.device = _CPU) -> Callable[[], float]:

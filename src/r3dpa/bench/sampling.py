@@ -259,7 +259,7 @@ def _concatenate(parts: Sequence[Solved]) -> Solved:
 
 
 def reference(problem: Problem, steps: int, num: int, work: Work) -> tuple[Solved, float]:
-    """The converged solution, and the RMSE of its latents from those of half the steps."""
+    """The converged solution, and the RMSE of its latents from a solution in half the steps."""
 
     def converged(count: int, indices: range) -> tuple[Tensor | None, ...]:
         return tuple(problem.converged(count, indices))

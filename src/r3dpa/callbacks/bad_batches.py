@@ -21,7 +21,7 @@ from r3dpa.modules.stage import PathDraws
 def save_bad_batch(
     folder: Path, module: GenerativeModule, batch: Mapping[str, Any], number: int, losses: Any
 ) -> Path:
-    """Writes a batch with the draws, loss weights and losses of its step; returns the file."""
+    """Write a batch with the draws, loss weights and losses of its step; return the file."""
     tensors = {key: value for key, value in batch.items() if isinstance(value, Tensor)}
     draws = module.draw_path(len(next(iter(tensors.values()))), number)
     weights = asdict(module.weights)
@@ -43,7 +43,11 @@ def save_bad_batch(
 
 
 def read_bad_batch(path: Path) -> dict[str, Any]:
-    """Content of a file of :func:`save_bad_batch`, or a ValueError that names the file."""
+    """Read a file of :func:`save_bad_batch`.
+
+    Raises:
+        ValueError: If the file is damaged; the error names it.
+    """
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
         return content | {"draws": PathDraws(**content["draws"])}
@@ -54,11 +58,14 @@ def read_bad_batch(path: Path) -> dict[str, Any]:
 def report_bad_batches(
     module: Any, batches: list[tuple[int, Any, dict[str, Tensor]]], norms: str, most: int
 ) -> None:
-    """Reports and saves the batches with a non-finite loss, or all batches if none has one."""
+    """Report and save the batches with a non-finite loss, or all batches if none has one."""
     folder = Path(module.trainer.default_root_dir) / "bad_batches"
-    read = [(n, batch, {k: float(v) for k, v in losses.items()}) for n, batch, losses in batches]
-    broken = [entry for entry in read if not all(map(math.isfinite, entry[2].values()))]
-    for number, batch, losses in broken or read:
+    entries = [
+        (number, batch, {name: float(loss) for name, loss in losses.items()})
+        for number, batch, losses in batches
+    ]
+    broken = [entry for entry in entries if not all(map(math.isfinite, entry[2].values()))]
+    for number, batch, losses in broken or entries:
         names = list(batch.get("name", ())) if isinstance(batch, dict) else []
         place = "not saved"
         num_saved = len(list(folder.glob(f"step_*_rank_{module.global_rank}.pt")))
@@ -68,13 +75,13 @@ def report_bad_batches(
             except OSError as error:  # a full disk is no reason to end a run that could go on
                 place = f"not saved: {error}"
         warnings.warn(
-            f"step {module.global_step} was skipped: losses {listed(losses)}; gradient norms "
-            f"{norms}; samples {', '.join(names) or 'without names'} (batch {number}, process "
-            f"{module.global_rank}), {place}",
+            f"step {module.global_step} was skipped: losses {format_values(losses)}; "
+            f"gradient norms {norms}; samples {', '.join(names) or 'without names'} "
+            f"(batch {number}, process {module.global_rank}), {place}",
             stacklevel=2,
         )
 
 
-def listed(values: Mapping[str, float]) -> str:
-    """Names and values in one line."""
+def format_values(values: Mapping[str, float]) -> str:
+    """Write names and values in one line."""
     return ", ".join(f"{name} {value:.3g}" for name, value in values.items()) or "unknown"

@@ -27,7 +27,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any | None = None
     ) -> None:
-        """Writes a checkpoint; an OSError names the file and the reason."""
+        """Write a checkpoint; an OSError names the file and the reason."""
         # A file object: torch's own errors do not name the reason.
         with atomic_path(path) as temporary, temporary.open("wb") as file:
             torch.save(checkpoint, file)
@@ -40,25 +40,25 @@ class RunCheckpoint(ModelCheckpoint):
 
     After SIGTERM, as job systems send it before they end a job, or Ctrl-C (SIGINT) the next
     optimiser step, or the next validation batch of a single process, is the last: ``last.ckpt`` is
-    saved and all processes end with status 143 or 130. One of several needs to get the signal. A
-    second Ctrl-C ends a single process at once, without saving.
+    saved and all processes end with status 143 or 130. It is enough that one process receives the
+    signal. A second Ctrl-C ends a single process at once, without saving.
 
     Processes that resume from different checkpoints are refused, and a run resumed at the end of an
     epoch starts the next one. After a resume within an epoch, Lightning's ``epoch`` counts one
     more; steps, weights and the end of the training do not depend on it.
     """
 
-    _signal = 0  # received by this process, 0 for none
+    _signal = 0  # received by this process; 0 without one
     _step = 0  # optimiser steps when a batch ended last
 
     def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
-        """Makes writes atomic, unless a strategy or plugin has a checkpoint format of its own."""
+        """Make writes atomic, unless a strategy or plugin has a checkpoint format of its own."""
         super().setup(trainer, pl_module, stage)
         if type(trainer.strategy.checkpoint_io) is TorchCheckpointIO:
             trainer.strategy.checkpoint_io = AtomicCheckpointIO()
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Replaces Lightning's signal handlers, which end training without saving."""
+        """Replace Lightning's signal handlers, which end training without saving."""
         super().on_train_start(trainer, pl_module)
         first = trainer.strategy.broadcast(trainer.global_step)
         if trainer.global_step != first:
@@ -81,7 +81,7 @@ class RunCheckpoint(ModelCheckpoint):
                 signal.signal(number, stop)
 
     def on_after_backward(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Sends the stop signal with the guard's all-reduce."""
+        """Send the stop signal with the guard's all-reduce."""
         guard = _guard(trainer)
         if guard is not None:
             guard.stop = self._signal
@@ -89,7 +89,7 @@ class RunCheckpoint(ModelCheckpoint):
     def on_train_batch_end(
         self, trainer: L.Trainer, pl_module: L.LightningModule, *args: Any, **kwargs: Any
     ) -> None:
-        """Saves on time; then stops on a signal."""
+        """Save on time; then stop on a signal."""
         super().on_train_batch_end(trainer, pl_module, *args, **kwargs)
         if trainer.global_step != self._step:  # else gradients are still to be accumulated
             self._step = trainer.global_step
@@ -98,7 +98,7 @@ class RunCheckpoint(ModelCheckpoint):
     def on_validation_batch_end(
         self, trainer: L.Trainer, pl_module: L.LightningModule, *args: Any, **kwargs: Any
     ) -> None:
-        """Stops on a signal: a validation may take longer than a job system waits.
+        """Stop on a signal: a validation may take longer than a job system waits.
 
         Not with several processes, which may have unequal numbers of batches here.
         """
@@ -129,7 +129,7 @@ class RunCheckpoint(ModelCheckpoint):
         raise SystemExit(128 + number)  # as a shell reports it
 
     def _save_last_checkpoint(self, trainer: L.Trainer, monitor_candidates: Any) -> None:
-        """Replaces ``last.ckpt`` in a run folder that was moved or copied, too.
+        """Replace ``last.ckpt`` in a run folder that was moved or copied, too.
 
         Lightning takes the file there for another run's and writes ``last-v1.ckpt``.
         """
@@ -138,7 +138,7 @@ class RunCheckpoint(ModelCheckpoint):
         super()._save_last_checkpoint(trainer, monitor_candidates)
 
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Saves unless the last step is saved already, or this is a ``fast_dev_run``."""
+        """Save the last step, unless it is saved already or this is a ``fast_dev_run``."""
         if cast(Any, trainer).fast_dev_run:
             return  # Lightning would save here, though nowhere else
         if self._last_global_step_saved != trainer.global_step:
@@ -146,7 +146,7 @@ class RunCheckpoint(ModelCheckpoint):
         super().on_train_end(trainer, pl_module)
 
     def on_fit_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Saves where all steps were trained before, but ``last.ckpt`` is older: of a killed run.
+        """Save where a killed run had trained all steps, but its ``last.ckpt`` is older.
 
         Lightning ends such a training without calling ``on_train_end``.
         """
@@ -159,11 +159,12 @@ class RunCheckpoint(ModelCheckpoint):
 
 
 def _guard(trainer: L.Trainer) -> StepGuard | None:
-    return next((one for one in cast(Any, trainer).callbacks if isinstance(one, StepGuard)), None)
+    callbacks = cast(Any, trainer).callbacks
+    return next((guard for guard in callbacks if isinstance(guard, StepGuard)), None)
 
 
 def _start_next_epoch(trainer: L.Trainer) -> None:
-    """Starts an epoch anew where the checkpoint was written after the last batch of one.
+    """Start an epoch anew where the checkpoint was written after the last batch of one.
 
     Lightning would go on within that epoch, train a batch of the next one there and drop the rest.
     """

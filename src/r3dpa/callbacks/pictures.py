@@ -33,7 +33,7 @@ class ReconstructionWriter(L.Callback):
         batch_idx: int,
         dataloader_idx: int = 0,
     ) -> None:
-        """Writes the points of each reconstructed range image, intensity 0."""
+        """Write the points of each reconstructed range image, intensity 0."""
         folder = Path(trainer.default_root_dir) / "reconstructions"
         for name, range_m in zip(batch["name"], outputs.float().cpu(), strict=True):
             points = points_of(range_m, pl_module.scan_geometry.projection)
@@ -57,7 +57,7 @@ class PictureLogger(L.Callback):
         self.seed = seed
 
     def on_validation_end(self, trainer: L.Trainer, pl_module: Any) -> None:
-        """Draws after a validation run, but not after the sanity check; a failure is a warning."""
+        """Draw after a validation run, but not after the sanity check; a failure is a warning."""
         if trainer.sanity_checking:
             return
         try:
@@ -66,7 +66,7 @@ class PictureLogger(L.Callback):
             rank_zero_warn(f"no pictures at step {trainer.global_step}: {first_line(error)}")
 
     def on_test_end(self, trainer: L.Trainer, pl_module: Any) -> None:
-        """Draws after a test run."""
+        """Draw after a test run."""
         self._draw(trainer, pl_module, "test")
 
     def _draw(self, trainer: L.Trainer, module: GenerativeModule | Baseline, split: str) -> None:

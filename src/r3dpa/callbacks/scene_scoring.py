@@ -43,28 +43,28 @@ _SAMPLER = SamplerConfig()
 class SceneScorer(L.Callback):
     """Samples scenes after a test run and compares them with real scans.
 
-    The processes share the sampling, in the same batches whatever their number; the first one
-    compares. It prints the table of ``r3dpa evaluate``, logs its numbers as ``test/<metric>`` and
-    writes them with tables and figures to ``<run_dir>/evaluation``, which all processes must see.
-    A stage that trains no velocity samples nothing.
+    All processes sample, in batches that do not depend on their number; the first one compares. It
+    prints the table of ``r3dpa evaluate``, logs its numbers as ``test/<metric>`` and writes them
+    with tables and figures to ``<run_dir>/evaluation``, which must be visible to all processes.
+    Nothing is sampled in a stage that trains no velocity.
 
     Args:
-        num_scenes: Scenes to sample, more than there are features; 0 samples none.
+        num_scenes: Number of scenes, larger than the number of features; 0 samples none.
         batch_size: Scenes sampled together.
         sampler: Solver and steps.
-        precision: Of the networks that sample.
-        seed: Of the scenes, see :class:`SceneGenerator`.
+        precision: Precision of the networks that sample.
+        seed: Seed of the scenes, see :class:`SceneGenerator`.
         reference: File of ``r3dpa data reference``, or R3DPA's own ``data_statistics.npy``. Without
             it, all scans of the data module are the reference, training and held-out; their
             statistics are computed once and kept in ``<run_dir>/evaluation/reference.safetensors``.
-        split: Of ``data_statistics.npy`` alone; ``val`` where it holds both and none is given.
-        spaces: Feature spaces; where None, those that need no file or have one in ``ckpt``.
+        split: Split of ``data_statistics.npy``; default: ``val``, if it holds both.
+        spaces: Feature spaces; default: all that need no file or have one in ``ckpt``.
         ckpt: Official weights by space.
-        protocol: ``default`` or ``published``; where None, that of the reference file, or
-            ``default`` without one.
-        allow_few: Accept fewer scenes than features: only to try it.
-        skip_bad: Leave out scenes that cannot be used, such as those without any return, and
-            report them; else the first one ends the test.
+        protocol: ``default`` or ``published``; default: as recorded in the reference file, else
+            ``default``.
+        allow_few: Accept fewer scenes than features; for trying out only.
+        skip_bad: Leave out and report unusable scenes, such as scenes without a return; otherwise
+            the first one ends the test.
     """
 
     def __init__(
@@ -90,7 +90,7 @@ class SceneScorer(L.Callback):
         self._job: tuple[AnyReference, list[SceneFeatures], list[Scan]] | None = None
 
     def on_test_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Checks all that can be checked before scenes are sampled."""
+        """Check all that can be checked before scenes are sampled."""
         self._job = None
         if not isinstance(pl_module, GenerativeModule | Baseline) or not self.num_scenes:
             return
@@ -127,7 +127,7 @@ class SceneScorer(L.Callback):
         self._job = (statistics, spaces, scans)
 
     def on_test_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Samples and compares."""
+        """Sample scenes and compare them with real scans."""
         if self._job is None or not isinstance(pl_module, GenerativeModule | Baseline):
             return
         statistics, spaces, scans = self._job
@@ -148,7 +148,7 @@ class SceneScorer(L.Callback):
             statistics = compute_reference(statistics, scans_from, spaces, path, renew=True)
         try:
             comparison = evaluate(
-                self._sampled(pl_module, folder, statistics),
+                self._read_scenes(pl_module, folder, statistics),
                 statistics,
                 spaces,
                 label=folder.absolute().parent.name,
@@ -176,19 +176,21 @@ class SceneScorer(L.Callback):
             logger.save()
 
     def _sample(self, trainer: L.Trainer, module: GenerativeModule | Baseline, folder: Path) -> int:
-        """Writes the batches of this process; network evaluations per scene, 0 without any."""
+        """Write the batches of this process; network evaluations per scene, 0 without any."""
         assert module.ema is not None
         generator = module.scene_generator(self.sampler, self.precision)
-        own = range(0, self.num_scenes, self.batch_size)[trainer.global_rank :: trainer.world_size]
-        quiet, nfe = None if trainer.is_global_zero else True, 0
-        for first in tqdm(own, "sampling", unit="batch", disable=quiet):
+        batches = range(0, self.num_scenes, self.batch_size)
+        batches = batches[trainer.global_rank :: trainer.world_size]
+        quiet = None if trainer.is_global_zero else True
+        nfe = 0
+        for first in tqdm(batches, "sampling", unit="batch", disable=quiet):
             indices = range(first, min(first + self.batch_size, self.num_scenes))
             scenes = generator.generate(indices, self.seed)
             nfe = scenes.nfe
             images = {"range_m": scenes.range_m, "intensity": scenes.intensity}
-            kept = {name: x.cpu().contiguous() for name, x in images.items() if x is not None}
+            tensors = {name: x.cpu().contiguous() for name, x in images.items() if x is not None}
             with atomic_path(_part(folder, first)) as temporary:
-                save_file(kept, temporary)
+                save_file(tensors, temporary)
         return nfe
 
     def _made_with(
@@ -208,15 +210,15 @@ class SceneScorer(L.Callback):
             "sampler": asdict(self.sampler),
         }
 
-    def _sampled(
+    def _read_scenes(
         self, module: GenerativeModule | Baseline, folder: Path, statistics: AnyReference
     ) -> Iterator[EvaluationScene]:
         """Scenes of all processes, in order; as points where the reference has other pixels."""
         projection = module.scan_geometry.projection
         for first in range(0, self.num_scenes, self.batch_size):
-            kept = load_file(_part(folder, first))
-            intensities = kept.get("intensity", [None] * len(kept["range_m"]))
-            images = zip(kept["range_m"], intensities, strict=True)
+            tensors = load_file(_part(folder, first))
+            intensities = tensors.get("intensity", [None] * len(tensors["range_m"]))
+            images = zip(tensors["range_m"], intensities, strict=True)
             for index, (range_m, intensity) in enumerate(images, first):
                 name = f"{index:06d}"
                 if projection == statistics.protocol.projection:
@@ -227,7 +229,7 @@ class SceneScorer(L.Callback):
 
 
 def _stamp(scans: Sequence[Scan]) -> str:
-    """Hash of names, sizes and times of change: scans replaced by others of their names differ."""
+    """Hash of names, sizes and modification times, which changes when a scan is replaced."""
     stats = [(scan.name, scan.path.stat()) for scan in scans]
     keys = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats]
     return hashlib.sha256(repr(keys).encode()).hexdigest()

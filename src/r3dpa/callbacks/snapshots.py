@@ -21,13 +21,13 @@ class EMASnapshots(L.Callback):
 
     Each step makes ``<run_dir>/snapshots/step_<step>.safetensors`` with its ``.yaml``: average,
     latent statistics, geometry, and a hash of the VAE, which is not kept. SiT-B/2 takes 550 MB. A
-    run that is resumed from an earlier step replaces them. A stage without average keeps none.
+    run that is resumed from an earlier step replaces them. A stage without average writes none.
 
     Source: Karras et al. 2024 guide EDM2-S best by a model after 1/16 of its training.
 
     Args:
         fractions: Steps as parts of ``trainer.max_steps``, in [0, 1].
-        steps: Optimiser steps, 1 or greater; where given, ``fractions`` do not count.
+        steps: Optimiser steps, 1 or greater; overrides ``fractions``.
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class EMASnapshots(L.Callback):
         self._step = 0  # after the last batch
 
     def on_fit_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Works out the steps, and refuses early what could not be written."""
+        """Determine the steps, and refuse early what could not be written."""
         self._due = frozenset()
         if not isinstance(pl_module, GenerativeModule) or pl_module.ema is None:
             stage = getattr(pl_module, "stage", type(pl_module).__name__)
@@ -69,13 +69,13 @@ class EMASnapshots(L.Callback):
             )
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Notes the step that the training goes on from, whose snapshot stays."""
+        """Record the step that training resumes from; its snapshot is not rewritten."""
         self._step = trainer.global_step
 
     def on_train_batch_end(
         self, trainer: L.Trainer, pl_module: L.LightningModule, *args: Any, **kwargs: Any
     ) -> None:
-        """Writes the snapshot of this step if one is due."""
+        """Write the snapshot of this step if one is due."""
         step = trainer.global_step
         if step == self._step:  # with accumulated gradients, several batches end at one step
             return

@@ -11,20 +11,20 @@ from jsonargparse.typing import NonNegativeInt, PositiveInt
 from lightning.pytorch.utilities import rank_zero_warn
 from torch import Tensor
 
-from r3dpa.callbacks.bad_batches import listed, report_bad_batches
+from r3dpa.callbacks.bad_batches import format_values, report_bad_batches
 from r3dpa.modules.stage import gradient_norms
 
 
 class StepGuard(L.Callback):
     """Skips a step with a loss, gradient norm or buffer that is not finite, on any process.
 
-    A skipped step moves no weight, moment or average, and batch norm and latent statistics are put
-    back; ``train/skipped_steps`` counts it, and its batches are named and saved for ``r3dpa
-    replay``. Gradients that overflow through the loss scale of float16 are counted only.
+    A skipped step changes no weight, moment or average, and restores batch norm and latent
+    statistics; ``train/skipped_steps`` counts it, and its batches are named and saved for ``r3dpa
+    replay``. Overflows caused by the loss scale of float16 are only counted.
 
     Args:
         max_skipped_steps: Skipped steps in a row after which training stops.
-        saved_batches: Most batches that each process saves in ``<run_dir>/bad_batches``.
+        saved_batches: Maximum number of batches that a process saves in ``<run_dir>/bad_batches``.
     """
 
     def __init__(
@@ -40,7 +40,7 @@ class StepGuard(L.Callback):
     def on_train_batch_start(
         self, trainer: L.Trainer, pl_module: L.LightningModule, batch: Any, batch_idx: int
     ) -> None:
-        """Copies the buffers before the first batch of a step: the forward pass moves them."""
+        """Copy the buffers before the first batch of a step: the forward pass moves them."""
         if not self._batches:
             average = getattr(pl_module, "ema", None)
             averaged = set() if average is None else set(average.buffers())
@@ -49,13 +49,13 @@ class StepGuard(L.Callback):
         self._batches.append((trainer.fit_loop.epoch_loop.total_batch_idx, batch, {}))
 
     def on_after_backward(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Notes the losses of the batch."""
+        """Record the losses of the batch."""
         self._batches[-1][2].update(getattr(pl_module, "logged_losses", {}))
 
     def on_before_optimizer_step(
         self, trainer: L.Trainer, pl_module: Any, optimizer: torch.optim.Optimizer
     ) -> None:
-        """Skips the step if it is not finite; stops after ``max_skipped_steps`` in a row."""
+        """Skip the step if it is not finite; stop after ``max_skipped_steps`` in a row."""
         pl_module.grad_norms = gradient_norms(optimizer, pl_module.device)
         norms = torch.stack(list(pl_module.grad_norms.values()))
         bad_here, bad_losses, bad_gradients, bad_buffers, self.stop, idle = self._find_faults(norms)
@@ -79,7 +79,7 @@ class StepGuard(L.Callback):
         if scaler and scaler.get_scale() > 1 and not (bad_losses or bad_buffers):
             return
         self.in_a_row += 1
-        values = listed({name: float(norm) for name, norm in pl_module.grad_norms.items()})
+        values = format_values({name: float(norm) for name, norm in pl_module.grad_norms.items()})
         if bad_here or not bad_losses:
             report_bad_batches(pl_module, batches, values, self.saved_batches)
         if self.in_a_row >= self.max_skipped_steps:
@@ -91,7 +91,10 @@ class StepGuard(L.Callback):
             )
 
     def _find_faults(self, norms: Tensor) -> list[int]:
-        """Whether losses here, losses, gradients, buffers anywhere are bad; stop signal; idle."""
+        """Return flags of non-finite values, the stop signal, and whether all gradients are 0.
+
+        In order: losses of this process; losses, gradients and buffers of any process.
+        """
         losses = [values["loss"].to(norms) for _, _, values in self._batches if values]
         bad_losses = ~torch.stack([norms.new_zeros(()), *losses]).isfinite().all()
         moved = [b for b, _ in self._buffers if b.numel() and b.is_floating_point()]
@@ -105,9 +108,9 @@ class StepGuard(L.Callback):
         return torch.stack([bad_losses.int(), *shared, (~norms.any()).int()]).tolist()
 
     def state_dict(self) -> dict[str, int]:
-        """The two counts."""
+        """Return both counters."""
         return {"skipped": self.skipped, "in_a_row": self.in_a_row}
 
     def load_state_dict(self, state_dict: dict[str, int]) -> None:
-        """Resumes the counts."""
+        """Restore both counters."""
         self.skipped, self.in_a_row = state_dict["skipped"], state_dict["in_a_row"]

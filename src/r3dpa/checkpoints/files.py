@@ -68,11 +68,11 @@ def read_checkpoint(
 ) -> Checkpoint:
     """Read a checkpoint of any layout without running code from it.
 
-    Known are ours (``.safetensors`` with its ``.yaml``), those of Lightning (``.ckpt``), official
-    ones (``.pt``), released ones of the baselines, and image VAEs of diffusers
-    (``.safetensors``). With an official VAE ``<name>.pt`` come its ``<name>-latents-stats.pt`` and
-    ``<name>-discriminator-ckpt.pt``, and for a file without ``args`` an ``args.json`` in its
-    folder, or above a folder ``checkpoints``.
+    Layouts: ours (``.safetensors`` with its ``.yaml``), Lightning's (``.ckpt``), the official one
+    (``.pt``), the released ones of the baselines, and image VAEs of diffusers
+    (``.safetensors``). Also read are ``<name>-latents-stats.pt`` and
+    ``<name>-discriminator-ckpt.pt`` beside an official VAE ``<name>.pt``, and for a file without
+    ``args`` an ``args.json`` in its folder, or above a folder ``checkpoints``.
 
     Args:
         path: File to read, name of weights in this package, or ``hf://owner/name``.
@@ -167,7 +167,7 @@ def convert(
     source, out = Path(source), Path(out)
     checkpoint = read_checkpoint(source, sit_args=sit_args, encoding=encoding)
     if networks is not None or half:
-        checkpoint = replace(checkpoint, networks=_reduced(checkpoint, networks, half))
+        checkpoint = replace(checkpoint, networks=_select_networks(checkpoint, networks, half))
     left_out = dict(checkpoint.left_out)
     if to == "r3dpa":
         outputs = [save_checkpoint(checkpoint, out, overwrite=overwrite), out.with_suffix(".yaml")]
@@ -211,7 +211,7 @@ def _save_official(checkpoint: Checkpoint, out: Path, overwrite: bool) -> list[P
     return list(files)
 
 
-def _reduced(
+def _select_networks(
     checkpoint: Checkpoint, names: Sequence[str] | None, half: bool
 ) -> dict[str, NetworkState]:
     """Networks of these names, in float16 but for latent statistics, where ``half`` is set."""
@@ -239,7 +239,7 @@ def _neighbour(vae: Path, kind: str) -> Path:
 
 @contextmanager
 def _naming(path: Path) -> Iterator[None]:
-    """Turn what a damaged file raises into a ``ValueError`` that names the file."""
+    """Raise what a damaged file raises as a ``ValueError`` that names the file."""
     try:
         yield
     except (yaml.YAMLError, SafetensorError, *UNPICKLING_ERRORS) as error:

@@ -135,7 +135,8 @@ class NetworkState:
         Raises:
             ValueError: If the class refuses the arguments.
         """
-        kind, arguments = self.kind, {key: _tuples(value) for key, value in self.init_args.items()}
+        kind = self.kind
+        arguments = {key: _tuples(value) for key, value in self.init_args.items()}
         try:
             return kind(**arguments)
         except UNPICKLING_ERRORS as error:
@@ -177,7 +178,7 @@ class NetworkState:
                 )
 
     def problems(self, network: nn.Module) -> list[str]:
-        """All keys and shapes that differ between ``network`` and these weights."""
+        """List the keys and shapes that differ between ``network`` and these weights."""
         wanted, given = shapes_of(network.state_dict()), shapes_of(self.state_dict)
         differ = [key for key in wanted if key in given and wanted[key] != given[key]]
         return [
@@ -187,7 +188,7 @@ class NetworkState:
         ]
 
     def _refuse_problems(self, network: nn.Module) -> None:
-        problems = _shortened(self.problems(network))
+        problems = _shorten(self.problems(network))
         if problems:
             raise ValueError("\n  ".join([f"the weights do not fit {self.class_path}:", *problems]))
 
@@ -197,7 +198,7 @@ class Checkpoint:
     """Everything a checkpoint file says about its networks, whatever its format.
 
     Networks are called ``vae``, ``discriminator``, ``sit``, ``latent_norm``, ``thin_decoder``, and
-    the averaged copies ``ema`` and ``ema_latent_norm``; those of a baseline ``network``,
+    the averaged copies ``ema`` and ``ema_latent_norm``; networks of a baseline ``network``,
     ``ema_network`` and ``first_stage``. A field is None if the file does not state it.
     """
 
@@ -256,7 +257,7 @@ def load_into(networks: Mapping[str, nn.Module], checkpoint: Checkpoint, stage: 
             problems.append(f"{error}; {stage} needs: {', '.join(networks)}")
             continue
         differences = _different_settings(state, network) + state.problems(network)
-        problems += [f"{name}: {line}" for line in _shortened(differences)]
+        problems += [f"{name}: {line}" for line in _shorten(differences)]
     if problems:
         raise ValueError(
             f"{stage} cannot start from {checkpoint.path}:\n  "
@@ -279,6 +280,6 @@ def _different_settings(state: NetworkState, network: nn.Module) -> list[str]:
     return differences
 
 
-def _shortened(lines: list[str]) -> list[str]:
+def _shorten(lines: list[str]) -> list[str]:
     rest = len(lines) - _NUM_LISTED
     return lines if rest <= 0 else [*lines[:_NUM_LISTED], f"... and {rest} more"]

@@ -95,7 +95,7 @@ def from_official(
             elif key == "vae" and _is_vae(value):
                 networks[key] = _vae(_weights(key, value))
             elif key == "vae":
-                left_out[key] = "that of the file is not for range images"
+                left_out[key] = "the file's VAE is not for range images"
             elif key == "discriminator":
                 networks[key] = _discriminator(_weights(key, value))
             elif key in _OPTIMISERS:
@@ -103,7 +103,7 @@ def from_official(
             elif key not in {"args", "steps"} | _STATISTICS:
                 left_out[key] = "no part of an official checkpoint"
     except (LookupError, TypeError) as error:
-        reason = f"the weights are not those of an official network ({type(error).__name__}: "
+        reason = f"the weights do not belong to an official network ({type(error).__name__}: "
         raise ValueError(f"{reason}{error})") from error
     return Checkpoint(
         path=path,
@@ -140,7 +140,7 @@ def _from_ours(content: Mapping[str, Any], path: Path, sit_args: Options) -> Che
 def to_official(checkpoint: Checkpoint) -> dict[str, Any]:
     """Content of an official training checkpoint, without optimisers.
 
-    The statistics of ``ema`` are those of ``latent_norm`` if the checkpoint has no others. Without
+    ``ema`` takes the statistics of ``latent_norm`` if the checkpoint has no others. Without
     the options of an official run, ``args`` is made from the arguments of the networks.
     """
     content: dict[str, Any] = {}

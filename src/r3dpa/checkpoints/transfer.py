@@ -37,11 +37,12 @@ def transfer_rgb(
 ) -> list[TransferRow]:
     """Start a range-image SiT and its latent statistics from an RGB checkpoint.
 
-    ``sit`` and ``latent_norm`` are changed in place. Fresh, that is unchanged, stay: patch
-    embedding, output layer and latent statistics if the number of latent channels differs, the
-    former two also if the patch size does; the position table if the token grid differs; the
-    projector without ``keep_projector``, or if it does not fit. A label table is cut to its first
-    row if this run has one. All other weights must fit. Returns a row for each group of weights.
+    ``sit`` and ``latent_norm`` are changed in place. Some groups keep their initial values
+    ("fresh"): patch embedding and output layer if the number of latent channels or the patch size
+    differs; latent statistics if the number of latent channels differs; the position table if the
+    token grid differs; the projector without ``keep_projector``, or if it does not fit. A label
+    table is cut to its first row if this run has one. All other weights must fit. Returns a row
+    for each group of weights.
 
     Source: tuning stages of valeoai/R3DPA, which keep the position table of another latent size if
     it has as many tokens.
@@ -53,11 +54,11 @@ def transfer_rgb(
     rgb, statistics = checkpoint.network("sit"), checkpoint.network("latent_norm")
     if not issubclass(rgb.kind, SiT):
         raise ValueError(
-            f"{checkpoint.path} holds a {rgb.kind.__name__}, but RGB weights are those of a SiT: "
+            f"{checkpoint.path} holds a {rgb.kind.__name__}, but RGB weights must belong to a SiT: "
             "give a checkpoint of stage rgb_pretraining, or an official one"
         )
-    theirs = _grouped(rgb.state_dict, statistics.state_dict)
-    ours = _grouped(sit.state_dict(), latent_norm.state_dict())
+    theirs = _group_weights(rgb.state_dict, statistics.state_dict)
+    ours = _group_weights(sit.state_dict(), latent_norm.state_dict())
     patch = rgb.arguments["patch_size"]
     same_grid = tuple(side // patch for side in rgb.arguments["input_size"]) == sit.grid_size
     init_args = rgb.arguments | {"input_size": sit.input_size}
@@ -101,7 +102,8 @@ def with_further_channels(checkpoint: Checkpoint, vae: VAE) -> Checkpoint:
     wider = replace(
         state, init_args={**state.init_args, **channels}, state_dict={**state.state_dict, **layers}
     )
-    networks, geometry = {**checkpoint.networks, "vae": wider}, checkpoint.geometry
+    networks = {**checkpoint.networks, "vae": wider}
+    geometry = checkpoint.geometry
     if geometry is not None:
         channels = {"intensity_channel": vae.intensity, "num_classes": vae.num_classes}
         geometry = {**geometry, "codec": {**geometry["codec"], **channels}}
@@ -116,7 +118,7 @@ def _transfer_result(
     same_grid: bool,
 ) -> tuple[Result, str]:
     """Result of a group of weights and its reason, by the rules of the official tuning stages."""
-    rgb, own = (_largest(groups.get(group, {})) for groups in (theirs, ours))
+    rgb, new = (_largest(groups.get(group, {})) for groups in (theirs, ours))
     embeddings = [_largest(groups["x_embedder"]) for groups in (theirs, ours)]
     channels, patches = ([shape[axis] for shape in embeddings] for axis in (1, 2))
     of_patches = group in ("x_embedder", "final_layer.linear")
@@ -125,17 +127,17 @@ def _transfer_result(
     if of_patches and patches[0] != patches[1]:
         return "fresh", "other patch size"
     if group == "pos_embed" and not same_grid:
-        return "resized", "other token grid: computed for that of this run"
+        return "resized", "other token grid: recomputed for this run"
     if group == "projector" and not keep_projector:
         return "fresh", "not requested"
     if group == "projector" and shapes_of(theirs.get(group, {})) != shapes_of(ours[group]):
         return "fresh", "requested, but its shapes differ"
-    if group == "y_embedder" and own[0] == 1 < rgb[0]:
+    if group == "y_embedder" and new[0] == 1 < rgb[0]:
         return "truncated", "one row here: the first is taken"
     return "kept", "fits"
 
 
-def _grouped(sit: Weights, norm: Weights) -> dict[str, dict[str, Tensor]]:
+def _group_weights(sit: Weights, norm: Weights) -> dict[str, dict[str, Tensor]]:
     """Weights of both networks by the part of their key that decides what happens to them."""
     groups: dict[str, dict[str, Tensor]] = {}
     for key, value in {**sit, **{_NORM + k: v for k, v in norm.items()}}.items():
@@ -153,7 +155,7 @@ def _largest(weights: Weights) -> tuple[int, ...]:
 class WeakModel:
     """Averaged network in evaluation mode on the CPU, with facts about its training.
 
-    Its normalised latents are ``scale * latents + shift`` of those of the model that it guides,
+    Where the model that it guides has normalised ``latents``, it has ``scale * latents + shift``,
     see :func:`r3dpa.flow.renormalised`; ``shift`` is ``(C,)`` float32.
     """
 
@@ -176,7 +178,7 @@ def read_snapshot(
     Args:
         path: File of :class:`r3dpa.callbacks.EMASnapshots`, or any checkpoint with an average.
         strong: Checkpoint of the model to be guided.
-        weights: Whose latent statistics it uses, those of the average or of the last step.
+        weights: Whether it uses the latent statistics of the average or of the last step.
     """
     weak = read_checkpoint(path)
     if not {"ema", "ema_latent_norm"} <= set(weak.networks):
@@ -200,9 +202,10 @@ def read_snapshot(
     scale = ratios.log().mean().exp()
     spread = (ratios / scale - 1).abs().max().item()
     shift = ((strong_norm.running_mean - norm.running_mean).double() / deviation).float()
-    reason, vae = "", _vae_note(weak)
+    reason = ""
+    vae = _vae_note(weak)
     if vae is None or vae != _vae_note(strong):
-        reason = "its latents are those of another VAE, as within stage joint"
+        reason = "its latents come from another VAE, as within stage joint"
     elif spread > NORM_TOLERANCE:
         limit = f"{NORM_TOLERANCE:.0%}"
         reason = f"the scales of its latents differ by {spread:.1%} between channels, over {limit}"

@@ -13,8 +13,8 @@ class Command(NamedTuple):
     """Function ``file:name`` below ``r3dpa.cli``, or of another module, and summary for the help.
 
     jsonargparse reads the function: its arguments are the options, its docstring is the help, and
-    what it returns is printed. Those of :data:`OWN_PARSER` take the words of the command line. A
-    ``resumable`` command continues its work when it is repeated after an interrupt.
+    what it returns is printed. Functions of :data:`OWN_PARSER` take the words of the command line.
+    A ``resumable`` command continues its work when it is repeated after an interrupt.
     """
 
     target: str
@@ -126,8 +126,8 @@ def main(args: list[str] | None = None) -> None:
     """Run the command line.
 
     Args:
-        args: Words after ``r3dpa``. Default: those of the process, with errors about files or
-            values as one line on the terminal instead of a traceback.
+        args: Words after ``r3dpa``. Default: the arguments of the process, with errors about files
+            or values as one line on the terminal instead of a traceback.
     """
     if args is not None:
         _run(args)

@@ -160,7 +160,7 @@ def resolve_config(words: Sequence[str]) -> dict[str, Any]:
     from r3dpa.cli.stages import run
 
     with redirect_stdout(StringIO()) as printed, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Lightning: the words are not those of the process
+        warnings.simplefilter("ignore")  # Lightning: the process has other words
         try:
             run([*words, "--print_config"])
         except SystemExit as ended:

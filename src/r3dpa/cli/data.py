@@ -139,8 +139,14 @@ def objects(
     library = object_library(iter(shown), extractor, projection, sit.grid_size)
     library.save(out)
     rows = [
-        [one.name, f"{one.num_scans}", f"{one.num_cells}", f"{one.num_points}", f"{one.spread:.3f}"]
-        for one in library.classes
+        [
+            item.name,
+            f"{item.num_scans}",
+            f"{item.num_cells}",
+            f"{item.num_points}",
+            f"{item.spread:.3f}",
+        ]
+        for item in library.classes
     ]
     table = text_table(rows, ["class", "scans", "cells", "points", "spread"], "rrrrr", "plain")
     spread = "Spread: mean of 1 - cosine between the class's feature and its cells."

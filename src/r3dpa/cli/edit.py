@@ -47,7 +47,18 @@ def inpaint(
         num: Number of results, one per seed index.
         **options: See :class:`EditOptions`.
     """
-    arguments = dict(locals())
+    arguments = {
+        "scan": scan,
+        "box": box,
+        "box3d": box3d,
+        "mask": mask,
+        "objects": objects,
+        "object": object,
+        "strength": strength,
+        "window": window,
+        "start": start,
+        "dilation": dilation,
+    }
     if sum(region is not None for region in (box, box3d, mask)) != 1:
         raise ValueError("give one of --box, --box3d and --mask: the part that is to change")
     if (objects is None) != (object is None):
@@ -110,7 +121,15 @@ def mix(
         num: Number of results, one per seed index.
         **options: See :class:`EditOptions`.
     """
-    arguments = dict(locals())
+    arguments = {
+        "left": left,
+        "right": right,
+        "split": split,
+        "blend": blend,
+        "features_ckpt": features_ckpt,
+        "strength": strength,
+        "window": window,
+    }
     check_features(EditOptions(**options).ckpt)
     from r3dpa.cli.edit_session import EditSession
     from r3dpa.editing.regions import mask_of_tokens, sector_weights
@@ -158,7 +177,8 @@ def complete(
         keep_every: Keep every n-th beam and fill the rest: 2 upsamples 32 beams to 64.
         empty_beams: Fill what the beams do not reach, as in a scan of fewer beams: rows without a
             return, and empty pixels between two returns at most 8 rows apart.
-        other_sensor: Keep what so many beams between two inclinations (degrees) see: ``32 -25 3``.
+        other_sensor: Keep what a sensor of n beams between two inclinations (degrees) sees:
+            ``32 -25 3``.
         mask: Picture of H x W pixels as the range image, bright where it is missing.
         start: Time of the noise that R3DPA adds, in (0, 1]; default: 0.2.
         resamplings: How often RePaint crosses each interval; default: 10.
@@ -166,9 +186,17 @@ def complete(
         workers: Processes that complete scans of a folder.
         **options: See :class:`EditOptions`.
     """
-    arguments = dict(locals())
-    given = (sector, keep_every, other_sensor, mask)
-    if not empty_beams and all(value is None for value in given):
+    arguments = {
+        "scan": scan,
+        "sector": sector,
+        "keep_every": keep_every,
+        "empty_beams": empty_beams,
+        "other_sensor": other_sensor,
+        "mask": mask,
+        "start": start,
+        "resamplings": resamplings,
+    }
+    if not empty_beams and all(part is None for part in (sector, keep_every, other_sensor, mask)):
         raise ValueError(
             "nothing is missing: give --sector, --keep_every, --empty_beams, --other_sensor or "
             "--mask"
@@ -190,7 +218,7 @@ def vary(*, scan: Path, start: float = 0.5, num: PositiveInt = 8, **options: Any
         num: Number of results, one per seed index.
         **options: See :class:`EditOptions`.
     """
-    arguments = dict(locals())
+    arguments = {"scan": scan, "start": start}
     from r3dpa.cli.edit_session import EditSession
 
     session = EditSession(EditOptions(**options), num)
@@ -208,7 +236,7 @@ def interpolate(*, left: Path, right: Path, frames: int = 8, **options: Any) -> 
         frames: Number of scenes, both ends included.
         **options: See :class:`EditOptions`.
     """
-    arguments = dict(locals())
+    arguments = {"left": left, "right": right, "frames": frames}
     if frames < 2:
         raise ValueError(f"frames must be at least 2, the two scans; got {frames}")
     from r3dpa.cli.edit_session import EditSession

@@ -1,4 +1,4 @@
-"""Completion of scans from files: generated points after those of the scan, and errors."""
+"""Completion of scans from files: generated points appended to the scan's, and errors."""
 
 from __future__ import annotations
 
@@ -86,10 +86,10 @@ class CompletionJob:
 
     Args:
         root: Folder that names of results are relative to.
-        options: Those of the edit.
+        options: Options of the edit.
         missing: What is missing.
         num: Results per scan.
-        start: Time of the noise; default: that of the editor.
+        start: Time of the noise; default: the editor's.
         resamplings: Of RePaint.
         threads: Of torch in each process; None leaves them as they are.
     """
@@ -209,8 +209,8 @@ def _completed_cloud(
 ) -> PointCloud:
     """Scan with all its points, and generated ones where it has no point.
 
-    Intensity and further columns of generated points are those of the nearest point of the scan, if
-    the model has no intensity; labels are those of the model, else 0.
+    Generated points take intensity and further columns from the nearest point of the scan, if the
+    model has no intensity; labels come from the model, else they are 0.
     """
     points, projection = cloud.points.astype(np.float32), result.projection
     empty = missing & ~_occupied(torch.from_numpy(points), projection)
@@ -242,14 +242,14 @@ def _occupied(points: Tensor, projection: Projection) -> Tensor:
     return occupied
 
 
-def held_out_errors(made: Tensor, range_m: Tensor, missing: Tensor) -> dict[str, Any]:
+def held_out_errors(completed: Tensor, range_m: Tensor, missing: Tensor) -> dict[str, Any]:
     """Errors of completions ``(B, H, W)`` on the returns of the scan, beside interpolations.
 
     Ranges are compared where the scan and all methods have a return; empty without any there.
     """
     if not ((range_m > 0) & missing).any():
         return {}
-    images = {"completed": made}
+    images = {"completed": completed}
     for how in ("linear", "nearest"):
         images[how] = interpolate_gaps(range_m, missing, how)[None]
     common = missing & (torch.cat(list(images.values())) > 0).all(dim=0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -32,7 +31,7 @@ from r3dpa.features import feature_source
 from r3dpa.flow.sampler import SamplerConfig
 from r3dpa.flow.solvers import evaluations
 from r3dpa.geometry import Pixels, in_range, project_pixels
-from r3dpa.io import atomic_path, usable_device, write_text
+from r3dpa.io import atomic_path, json_values, usable_device, write_text
 from r3dpa.nn import VelocityNetwork
 from r3dpa.scenes import SceneBatch
 from r3dpa.stages import BASELINE_STAGES, scene_generator
@@ -52,7 +51,7 @@ class ScanView(NamedTuple):
 
     @property
     def pixels(self) -> Pixels:
-        """What the model is given."""
+        """Input of the model."""
         return Pixels(self.range_m, self.intensity, self.classes)
 
 
@@ -250,7 +249,7 @@ class EditSession:
         request = {name: value for name, value in arguments.items() if name not in left_out}
         request |= provenance(self.checkpoint, options, self.num, self.device, self.geometry)
         request |= {"command": command, "guided": guided, "settings": settings, **sources}
-        return dict(json.loads(json.dumps(request, default=str)))  # paths as text
+        return dict(json_values(request, default=str))  # paths as text
 
     @contextmanager
     def _progress(self, command: str) -> Iterator[None]:
@@ -270,7 +269,7 @@ class EditSession:
         self,
         command: str,
         scans: Mapping[str, ScanView],
-        made: Tensor,
+        results: Tensor,
         parts: Tensor | None,
         part_names: Sequence[str],
     ) -> None:
@@ -280,9 +279,9 @@ class EditSession:
         images = torch.stack(list(before.values()))
         with atomic_path(out / "before.npy") as temporary, temporary.open("wb") as file:
             np.save(file, images.numpy())
-        for index, range_m in enumerate(made[: self.options.pictures]):
+        for index, range_m in enumerate(results[: self.options.pictures]):
             draw_scene(out, index, range_m, self.geometry)
-        after = {f"{command} {index}": image for index, image in enumerate(made[:_SHOWN])}
+        after = {f"{command} {index}": image for index, image in enumerate(results[:_SHOWN])}
         rows = [viz.EditRow(name, image) for name, image in before.items()]
         numbers = None
         if parts is not None:

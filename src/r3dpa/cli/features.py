@@ -133,7 +133,7 @@ def features_parser(prog: str) -> StageParser:
     )
     parser.add_argument("--config", action="config", help="YAML, the same as after --data")
     parser.add_lightning_class_args(LidarDataModule, "data", subclass_mode=True)
-    sources = f"one of {', '.join(SOURCES)}; default: that of the data, or scalr if --ckpt is given"
+    sources = f"one of {', '.join(SOURCES)}; default: as in the data, or scalr if --ckpt is given"
     parser.add_argument("--extractor", type=str | None, help=sources)
     parser.add_argument("--ckpt", type=Path | None, help="weights of the extractor")
     sizes = "such as '[[8, 64], [16, 128]]', all from one pass; default: grid_size of the data"

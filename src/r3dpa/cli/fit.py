@@ -18,7 +18,7 @@ from r3dpa.cli.presets import (
 )
 from r3dpa.pretrained import weights_file
 
-# Options of the stage commands, those of Lightning included, or the first part of their names.
+# Options of the stage commands and of Lightning, or the first part of their names.
 _OPTIONS = (
     "help",
     "config",

@@ -30,8 +30,8 @@ def describe_error(
 ) -> str:
     """Describe an error of a parser in one line.
 
-    jsonargparse raises the error of each level of a nested option from that of the next level: the
-    chain of causes names the option key by key, and its end is what is wrong.
+    jsonargparse raises the error of each level of a nested option from the error of the next level.
+    The chain of causes names the option key by key, and its end is what is wrong.
 
     Args:
         message: What jsonargparse would print.
@@ -83,7 +83,7 @@ def _init_args(owner: str) -> list[str]:
 
 
 def _argument_names(owner: str) -> list[str]:
-    """Arguments of a class, those of its base classes included."""
+    """Arguments of a class and of its base classes."""
     parser = ArgumentParser(exit_on_error=False)
     cls = pydoc.locate(owner)
     if inspect.isclass(cls):

@@ -193,7 +193,7 @@ def load(target: str) -> Callable[..., Any]:
 def make_parser(function: Callable[..., Any], prog: str | None = None) -> Parser:
     """Make the parser of a function.
 
-    Keyword-only arguments are options, and so are those of functions outside this package.
+    Keyword-only arguments are options, as are all arguments of functions outside this package.
     """
     positional = function.__module__.startswith(("r3dpa.cli.", "lidarsim.conversion"))
     description = cleandoc(function.__doc__ or "").partition("\n\nArgs:")[0]

@@ -14,10 +14,10 @@ def replay(file: Path, ckpt: Path, device: str = "cpu") -> str:
 
     Args:
         file: Batch of ``<run_dir>/bad_batches``.
-        ckpt: Weights, ideally those of the last step before it.
+        ckpt: Weights, ideally of the last step before it.
         device: ``cpu``, ``cuda`` or ``cuda:1``.
     """
-    from r3dpa.callbacks.bad_batches import listed, read_bad_batch
+    from r3dpa.callbacks.bad_batches import format_values, read_bad_batch
     from r3dpa.checkpoints import read_checkpoint
     from r3dpa.modules import FewStep, FlowMatching, JointAlignment, LossWeights, VAEAlignment
 
@@ -48,10 +48,11 @@ def replay(file: Path, ckpt: Path, device: str = "cpu") -> str:
             layer.register_forward_hook(partial(observe, name))
     try:
         module.training_step(batch, 0)
-    except RuntimeError as error:  # shapes of the batch against those of the networks
+    except RuntimeError as error:  # the shapes of the batch do not fit the networks
         raise ValueError(f"{file} cannot be run with the networks of {ckpt}: {error}") from error
-    lines.append(f"losses then: {listed(saved['losses'])}")
-    lines.append(f"losses now:  {listed({k: float(v) for k, v in module.logged_losses.items()})}")
+    lines.append(f"losses then: {format_values(saved['losses'])}")
+    losses = {name: float(loss) for name, loss in module.logged_losses.items()}
+    lines.append(f"losses now:  {format_values(losses)}")
     causes = ", ".join(name for name, inputs_finite in broken.items() if inputs_finite) or "none"
     lines.append(f"layers whose output is not finite: {len(broken)}, from finite inputs: {causes}")
     return "\n".join(lines)

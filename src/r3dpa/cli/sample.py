@@ -46,7 +46,7 @@ def sample(
         eta: Noise strength of the SDE; default: 1, as published.
         sde_last: Last SDE step: ``denoise`` (default) or ``mean`` as in the official sampler.
         autoguidance: Snapshot of a weaker model to guide away from; doubles the evaluations.
-        guidance_scale: Strength of guidance, 1 for none; default: that of the weights, which are
+        guidance_scale: Strength of guidance, 1 for none; default: as the weights record, which are
             guided away from themselves without one attention map; 2 with ``--autoguidance``.
         guidance_interval: Times of autoguidance, such as ``0.2 0.8``; 0 is data, 1 noise; default:
             all.

@@ -29,7 +29,7 @@ from r3dpa.modules import GenerativeModule
 
 # What a user can do nothing about, or what is intended: averages and frozen networks stay in
 # evaluation mode, feature grids go to disk, a process may have no scan, the means of held-out scans
-# are already those of all processes, and a stage's name stands for words that are not typed.
+# are already over all processes, and a stage's name stands for words that are not typed.
 _HARMLESS = (
     r"Found \d+ module\(s\) in eval mode",
     r"`isinstance\(treespec, LeafSpec\)` is deprecated",
@@ -107,7 +107,7 @@ class _RecordConfig(SaveConfigCallback):
     def hold_wandb_back(self, trainer: Trainer) -> None:
         """Take the wandb loggers out of a trainer until :meth:`on_train_start`."""
         self.loggers = list(trainer.loggers)
-        trainer.loggers = [one for one in self.loggers if not isinstance(one, WandbLogger)]
+        trainer.loggers = [logger for logger in self.loggers if not isinstance(logger, WandbLogger)]
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         if stage == "fit":  # evaluating a run does not replace its configuration

@@ -20,10 +20,17 @@ from lidarsim.faults import Fault, Kind
 from lidarsim.recorded import Instrument, RecordedScan
 from lidarsim.weather import Weather, WeatheredScan, changed_cloud, recorded_scan
 from r3dpa.cli.parser import check_folder
-from r3dpa.io import Journal, delete_unfinished, differences, in_processes, only_writer
+from r3dpa.io import (
+    Journal,
+    delete_unfinished,
+    differences,
+    in_processes,
+    json_values,
+    only_writer,
+)
 
 _REQUEST, _LINES, _REPORT, _PAGE = "request.json", ".unfinished.jsonl", "report.jsonl", "scans.html"
-_LOST, _MOVED = 254, 255  # colours of the page, beside those of Origin
+_LOST, _MOVED = 254, 255  # colours of the page, beside the values of Origin
 
 
 def weather(
@@ -100,7 +107,7 @@ class FolderOptions:
 
 
 @dataclass(frozen=True)
-class _Job:
+class _FolderRun:
     """Change of a run; a call applies it to a scan, writes the result and returns a report line."""
 
     root: Path
@@ -155,11 +162,11 @@ def _run(source: Path, change: Any, request: dict[str, Any], options: FolderOpti
     from r3dpa.data.scans import evenly
 
     root, files = find_files(source)
-    out, job = options.out, _Job(root, change, options)
+    out, job = options.out, _FolderRun(root, change, options)
     paths = {job.name(path): path for path in files}
     request |= {"source": str(root.resolve()), "seed": options.seed}
     request |= {"columns": options.columns, "drop_nan": options.drop_nan}
-    _check_out(root, out, files, json.loads(json.dumps(request)))
+    _check_out(root, out, files, json_values(request))
     with only_writer(out / ".lock", f"writes scans to {out}", wait=True):
         write(out / _REQUEST, to_json(request))
         lines = _lines(out)
@@ -237,7 +244,7 @@ def _lines(out: Path) -> dict[str, dict[str, Any]]:
 
 
 def _is_done(line: dict[str, Any], inputs: dict[str, list[int]], out: Path) -> bool:
-    """Whether the results of a scan are whole, and those of the inputs as they are now."""
+    """Whether the results of a scan are whole and made from its inputs as they are now."""
     if "error" in line or line.get("inputs") != inputs:
         return False
     results = {name: out / name for name in line["results"]}
@@ -273,7 +280,7 @@ def _summary(lines: list[dict[str, Any]], num_now: int, out: Path) -> str:
     return "\n".join([*texts, f"{out / _REPORT} has a line for each{page}"])
 
 
-def _write_page(job: _Job, files: list[Path]) -> None:
+def _write_page(job: _FolderRun, files: list[Path]) -> None:
     """Page of scans, each beside its result."""
     from r3dpa import viz
     from r3dpa.viz.scenes import write_page
@@ -291,10 +298,10 @@ def _write_page(job: _Job, files: list[Path]) -> None:
         made_by = result.origins.copy()
         made_by[: len(index)][away] = _MOVED
         sides = ((before, "", scan, fate), (after, ", changed", result, made_by))
-        for scans, note, one, origins in sides:
-            points = one.points
-            if one.intensity is not None:
-                points = np.column_stack([points, one.intensity.astype(np.float32)])
+        for scans, note, side, origins in sides:
+            points = side.points
+            if side.intensity is not None:
+                points = np.column_stack([points, side.intensity.astype(np.float32)])
             scans.append(viz.PageScan(f"{job.name(path)}{note}", points, origins=origins))
     more = {_LOST: viz.Category("lost", "#ff5c5c"), _MOVED: viz.Category("moved", "#ffb000")}
     title = f"{job.root.resolve().name} - r3dpa"

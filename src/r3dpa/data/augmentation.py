@@ -19,7 +19,7 @@ from torch.utils.data import Dataset
 from lidarsim.weather import WeatherPrior
 from r3dpa.data.datasets import LidarDataset
 
-# Separate these draws from those of the order, which have the same seed.
+# Separate these draws from the draws of the order, which have the same seed.
 _STREAM, _WEATHER_STREAM = 1, 2
 
 

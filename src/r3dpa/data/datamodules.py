@@ -64,7 +64,7 @@ class LidarDataModule(LoaderModule):
         extractor: Frozen network, see :class:`r3dpa.data.Extractor`; makes the grids that are
             missing before training. Without it, ``features_dir`` must hold all of them.
         features_dir: Folder of the feature grids of one extractor, of any grid sizes; by default
-            that of :func:`default_features_dir`. No grids without folder and extractor.
+            from :func:`default_features_dir`. No grids without folder and extractor.
         batch_size: Scans per batch **per process**; an optimiser step sees ``batch_size`` x
             processes x ``accumulate_grad_batches`` scans.
         num_workers: Loader processes per training process.
@@ -77,7 +77,7 @@ class LidarDataModule(LoaderModule):
             disks need; by default one process of all does, for a disk that the nodes share.
         augmentation: Rotation and mirroring of training scans; none by default.
         weather: Weather of training scans, drawn anew in each epoch; none by default. Feature grids
-            stay those of the clear scans, which ``augmentation.approximate_grids`` must allow.
+            stay as for the clear scans, which ``augmentation.approximate_grids`` must allow.
     """
 
     #: Whether the folder of scans is the data module's own, which may hold the feature grids too.
@@ -131,19 +131,19 @@ class LidarDataModule(LoaderModule):
             )
         if weather is not None and codec.num_classes:
             raise ValueError(
-                "weather: the labels of codec.num_classes are those of the clear scans. Switch one "
+                "weather: the labels of codec.num_classes belong to the clear scans. Switch one "
                 "of them off"
             )
         with_grids = self.features_dir is not None and not augmentation.approximate_grids
         if weather is not None and with_grids:
             raise ValueError(
-                "weather: the feature grids are those of the clear scans. Train without them, or "
+                "weather: the feature grids belong to the clear scans. Train without them, or "
                 "on these with augmentation.approximate_grids: true"
             )
 
     @property
     def feature_dim(self) -> int:
-        """Width D of the feature grids; 768, that of ScaLR, where none are used."""
+        """Width D of the feature grids; 768, as in ScaLR, where none are used."""
         if self.extractor is not None:
             return cast(Extractor, self.extractor).dim
         return _SCALR_DIM if self.features_dir is None else any_settings(self.features_dir).dim
@@ -232,7 +232,7 @@ class LidarDataModule(LoaderModule):
         """Train on cached posteriors ``(2C, h, w)`` of a frozen VAE."""
         if self.weather_prior is not None:
             raise ValueError(
-                "weather: cached posteriors are those of the clear scans. Switch it off, or encode "
+                "weather: cached posteriors belong to the clear scans. Switch it off, or encode "
                 "in each step: --model.init_args.cache_latents false"
             )
         self.train_set = replace(self.train_set, posteriors=posteriors)
@@ -292,7 +292,7 @@ def default_features_dir(scans: str | list[str], extractor: str) -> Path:
     beside the scans of a user; ``<scans>/feature_grids/<extractor>`` where that folder exists.
 
     Raises:
-        ValueError: If the scans are those of a file, glob or list.
+        ValueError: If the scans come from a file, glob or list.
     """
     if not isinstance(scans, str) or has_magic(scans) or Path(scans).is_file():
         raise ValueError(

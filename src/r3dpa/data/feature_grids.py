@@ -24,7 +24,7 @@ from r3dpa.data.loaders import plain_loader
 from r3dpa.data.scans import Scan
 from r3dpa.data.store import CachedTensors, Store, StoreError, writing
 from r3dpa.geometry import Projection, pool_cells, projection_to_dict
-from r3dpa.io import only_writer
+from r3dpa.io import json_values, only_writer
 
 REMEDY = "with `r3dpa data features --data <data YAML or folder>`"
 
@@ -64,7 +64,7 @@ class GridSettings:
     """Settings of the grids of one store.
 
     ``projection`` and ``extractor`` (its name and settings) are plain values, ``grid_size`` (h, w),
-    ``dim`` the width D; ``precision`` is that of the extractor, as Lightning names it.
+    ``dim`` the width D; ``precision`` the extractor's, as Lightning names it.
     """
 
     projection: dict[str, Any]
@@ -122,7 +122,7 @@ def _wanted(projection: Projection, extractor: Extractor | None) -> dict[str, An
     if extractor is not None:
         wanted["extractor"] = {"name": extractor.name, "settings": extractor.settings}
         wanted["dim"] = extractor.dim
-    return json.loads(json.dumps(wanted))
+    return dict(json_values(wanted))
 
 
 def _made_otherwise(key: str, stored: Any, wanted: Any, folder: Path) -> StoreError:

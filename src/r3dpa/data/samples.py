@@ -150,12 +150,12 @@ def _find(folder: Path) -> list[tuple[str, Path]]:
     if not files:
         raise ScanError(f"{folder}: holds no samples; what can be read: {READABLE}")
     if ".bin" in files and (len(files) == 1 or (folder / "data_3d_raw").is_dir()):
-        # Named as scans are; beside those of KITTI-360 there are time stamps.
+        # Named as scans are; KITTI-360 has time stamps beside its scans.
         return [(scan.name, scan.path) for scan in find_scans(folder)]
     if len(files) > 1:
-        found = ", ".join(f"{len(files[suffix])} {suffix}" for suffix in sorted(files))
+        formats = ", ".join(f"{len(files[suffix])} {suffix}" for suffix in sorted(files))
         raise ScanError(
-            f"{folder}: holds several formats ({found}), perhaps each scene more than once; "
+            f"{folder}: holds several formats ({formats}), perhaps each scene more than once; "
             "give one file or sub-folder"
         )
     (paths,) = files.values()

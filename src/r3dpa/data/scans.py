@@ -63,10 +63,10 @@ def find_scans(source: str | Path | Sequence[str | Path]) -> list[Scan]:
     """All scans of a folder (with its sub-folders), file, glob, or list of these, sorted.
 
     In the KITTI-360 layout (a folder that holds ``data_3d_raw``), only the Velodyne scans. Of other
-    folders and globs, the ``.bin`` files, or else those of another format that can be read. Links
+    folders and globs, the ``.bin`` files, or else files of one other format that can be read. Links
     to folders are followed; hidden files are left out. The drive of a scan is its folder relative
     to the given folder, or to the common parent of a glob or list. ``ValueError`` if nothing is
-    found, one file is named twice, or a name could not be that of an output file.
+    found, one file is named twice, or a name could not be an output file's.
     """
     given = [source] if isinstance(source, str | Path) else list(source)
     entries = [_without_dots(Path(entry).absolute()) for entry in given]
@@ -138,7 +138,7 @@ def scan_files(entry: str | Path) -> Iterator[Path]:
 
 
 def _of_one_format(source: Path, files: Iterable[Path]) -> list[Path]:
-    """Return the ``.bin`` files, or else those of the only other format."""
+    """Return the ``.bin`` files, or else the files of the only other format."""
     scans: dict[str, list[Path]] = {}
     for file in files:
         if suffix_of(file) in READERS and not file.name.startswith("."):
@@ -149,7 +149,7 @@ def _of_one_format(source: Path, files: Iterable[Path]) -> list[Path]:
             f"{source}: holds several formats ({formats}), perhaps each scan more than once: give "
             "a glob of one, such as '**/*.pcd'"
         )
-    return scans.get(".bin") or [file for found in scans.values() for file in found]
+    return scans.get(".bin") or [file for paths in scans.values() for file in paths]
 
 
 def _drive_files(drive: Path) -> Iterator[Path]:

@@ -25,6 +25,7 @@ from r3dpa.io import (
     append,
     delete_unfinished,
     differences,
+    json_values,
     no_follow,
     only_writer,
     write_text,
@@ -93,7 +94,7 @@ class SceneWriter:
         self.out, self.num, self.num_done, self.evaluations = out, num, 0, 0
         self._projection = projection
         self._formats = tuple(formats)
-        self._request = json.loads(json.dumps(request))  # tuples become lists, as in the file
+        self._request = json_values(request)
         self._journal = Journal(out / ".unfinished.json")
         self._unfinished = out / ".unfinished.npy"
         with ExitStack() as alone:

@@ -6,9 +6,9 @@ A store is a folder::
     shard_00000.rows     rows of fixed size
     shard_00000.jsonl    journal: {"scan": name, "bytes": size, "mtime_ns": time, "row": i} per row
 
-A line of the journal is written after its row is on disk; rows without a line and a torn last line
-are ignored. Every writer makes a shard of its own. A row belongs to the name, size and time of
-change of its file.
+A line of the journal is written after its row is on disk; rows without a line and an incomplete
+last line are ignored. Every writer makes a shard of its own. A row belongs to the name, size and
+time of change of its file.
 """
 
 from __future__ import annotations

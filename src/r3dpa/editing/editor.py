@@ -471,7 +471,7 @@ def _interpolated(pixels: Pixels, missing: Tensor) -> Pixels:
 
 
 def _paste(decoded: Pixels, scan: Pixels, mask: Tensor) -> Pixels:
-    """Decoded pixels ``(B, H, W)`` inside a mask ``(H, W)``, those of the scan outside."""
+    """Decoded pixels ``(B, H, W)`` inside a mask ``(H, W)``, pixels of the scan outside."""
     range_m = torch.where(mask, decoded.range_m, scan.range_m)
     intensity, classes = decoded.intensity, decoded.classes
     if intensity is not None:

@@ -22,7 +22,7 @@ from r3dpa.data.feature_grids import Extractor
 from r3dpa.data.labels import CLASS_NAMES, read_labels
 from r3dpa.data.scans import Scan
 from r3dpa.geometry import Projection, in_range, projection_to_dict
-from r3dpa.io import UNPICKLING_ERRORS, atomic_path, first_line
+from r3dpa.io import UNPICKLING_ERRORS, atomic_path, first_line, json_values
 
 _CARD = "r3dpa_objects"
 _VERSION = 1
@@ -33,7 +33,7 @@ class ObjectClass:
     """Statistics of one class, a name of :data:`CLASS_NAMES`.
 
     ``num_cells`` are the feature-grid cells that hold a point of it, ``spread`` the mean of
-    ``1 - cosine`` between the feature and those of the cells, in [0, 2].
+    ``1 - cosine`` between the feature and the features of the cells, in [0, 2].
     """
 
     name: str
@@ -211,7 +211,7 @@ def object_library(
     return ObjectLibrary(
         torch.stack([sums[name].mean().float() for name in names]),
         tuple(sums[name].result(name) for name in names),
-        json.loads(json.dumps({"name": extractor.name, "settings": extractor.settings})),
+        json_values({"name": extractor.name, "settings": extractor.settings}),
         projection_to_dict(projection),
         (grid_size[0], grid_size[1]),
     )

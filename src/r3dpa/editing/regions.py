@@ -107,7 +107,7 @@ def box3d(
 
 
 def dropped_beams(projection: Projection, kept: Sequence[int]) -> Tensor:
-    """Pixels ``(H, W)`` bool of all rows but those of ``kept``."""
+    """Pixels ``(H, W)`` bool of all rows that ``kept`` does not list."""
     beams = projection.sensor.beams
     missing = torch.ones(beams, projection.sensor.columns, dtype=torch.bool)
     missing[list(kept)] = False

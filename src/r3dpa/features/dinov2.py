@@ -33,7 +33,7 @@ Size = tuple[int, int]
 class TransformerTrunk(nn.Module):
     """Class token, learned positions and pre-norm blocks of a ViT, without the last norm.
 
-    Positions of the training grid ``grid_size`` are resized bilinearly to that of the patches.
+    Positions of the training grid ``grid_size`` are resized bilinearly to the grid of the patches.
 
     Source: ViT (Dosovitskiy et al. 2021); names and order of computation of timm.
     """
@@ -45,7 +45,9 @@ class TransformerTrunk(nn.Module):
         rows, columns = self.grid_size = grid_size
         self.cls_token = nn.Parameter(torch.zeros(1, 1, width))
         self.pos_embed = nn.Parameter(torch.randn(1, 1 + rows * columns, width) * _TABLE_STD)
-        self.blocks = nn.ModuleList(Block(width, num_heads, norm_eps) for _ in range(depth))
+        self.blocks = nn.ModuleList(
+            TransformerBlock(width, num_heads, norm_eps) for _ in range(depth)
+        )
 
     def forward(self, patches: Tensor) -> Tensor:
         """Class token, then row-major tokens, ``(B, 1 + N, D)``, of patches ``(B, D, h, w)``."""
@@ -84,12 +86,12 @@ def usual_heads(width: int) -> int:
     """Number of heads of the released ViT of this width, which its weights do not determine."""
     if width % _HEAD_WIDTH:
         raise ValueError(
-            f"tokens of width {width} do not divide into heads of {_HEAD_WIDTH}; give num_heads."
+            f"tokens of width {width} do not divide into heads of {_HEAD_WIDTH}; give num_heads"
         )
     return width // _HEAD_WIDTH
 
 
-class Block(nn.Module):
+class TransformerBlock(nn.Module):
     """Pre-norm transformer block; ``layer_scale`` weights the channels of both branches."""
 
     def __init__(
@@ -121,7 +123,7 @@ class _Scale(nn.Module):
 class DINOv2(nn.Module):
     """Vision transformer of DINOv2 without registers; the defaults are ViT-B/14.
 
-    State-dict keys and shapes are those of the released ``dinov2_vit{s,b,l}14_pretrain.pth``. The
+    State-dict keys and shapes as in the released ``dinov2_vit{s,b,l}14_pretrain.pth``. The
     features are the normalised patch tokens of the last block; positions are resized by antialiased
     bicubic interpolation.
 
@@ -136,7 +138,7 @@ class DINOv2(nn.Module):
         grid_size: Side of the token grid of the position table.
 
     Attributes:
-        trained: Whether the weights are those of a file.
+        trained: Whether the weights were read from a file.
     """
 
     mean: Tensor
@@ -156,7 +158,9 @@ class DINOv2(nn.Module):
         self.pos_embed = nn.Parameter(torch.randn(1, 1 + grid_size**2, dim) * 0.02)
         self.mask_token = nn.Parameter(torch.zeros(1, dim))  # of its training; not used here
         self.patch_embed = nn.ModuleDict({"proj": nn.Conv2d(3, dim, _PATCH, stride=_PATCH)})
-        self.blocks = nn.ModuleList(Block(dim, num_heads, _EPS, True) for _ in range(depth))
+        self.blocks = nn.ModuleList(
+            TransformerBlock(dim, num_heads, _EPS, True) for _ in range(depth)
+        )
         self.norm = nn.LayerNorm(dim, _EPS)
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN)[:, None, None], persistent=False)
         self.register_buffer("std", torch.tensor(IMAGENET_STD)[:, None, None], persistent=False)

@@ -31,7 +31,7 @@ _GATE_M, _GATE_SHARE = 0.3, 0.05
 _NOISE_M = 0.01
 _SENSOR_HEIGHT_M = 1.73
 _BANDWIDTH = 2.0  # of the Gaussian kernel, in standard deviations
-_KERNEL_WIDTH = 64  # K: the kernel is met up to 1 / sqrt(K)
+_KERNEL_WIDTH = 64  # K: the error of the kernel is about 1 / sqrt(K)
 #: Mean and standard deviation of the nine `GeometricFeatures.descriptors` over points of real
 #: HDL-64E scans.
 CENTRES = (0.47, 0.67, 0.13, -0.28, 0.23, 0.52, 0.63, 2.3, 0.26)
@@ -67,7 +67,7 @@ class GeometricFeatures(nn.Module):
     def __init__(self, dim: int = 768) -> None:
         super().__init__()
         if dim < 2 or dim % 2:
-            raise ValueError(f"dim must be even and at least 2, got {dim}.")
+            raise ValueError(f"dim must be even and at least 2, got {dim}")
         self.dim = dim
         self.settings: dict[str, Any] = {"seed": 0, "version": 2}
         width = min(dim, _KERNEL_WIDTH)
@@ -86,7 +86,7 @@ class GeometricFeatures(nn.Module):
         and the normal n, the axis of s3, turned towards the sensor:
 
         0. linearity 1 - s2/s1 (1 where the neighbours lie on a line),
-        1. planarity (s2 - s3)/(s2 + 1 cm) (near 1 where they lie on a plane however sampled),
+        1. planarity (s2 - s3)/(s2 + 1 cm) (near 1 where they lie on a plane, at any sampling),
         2. sphericity s3/s1,
         3. n along the horizontal viewing direction, 4. n across it without its sign, which a mirror
         would turn, 5. n upwards,
@@ -110,8 +110,8 @@ class GeometricFeatures(nn.Module):
         across = (normal[:, 1] * cos - normal[:, 0] * sin).abs()
         height = xyz[:, 2] + _SENSOR_HEIGHT_M
         log_range = radius.clamp_min(0.1).log()
-        own = [along, across, normal[:, 2], height, log_range, points[:, 3].float()]
-        return torch.cat([shape, torch.stack(own, dim=1)], dim=1)
+        rest = [along, across, normal[:, 2], height, log_range, points[:, 3].float()]
+        return torch.cat([shape, torch.stack(rest, dim=1)], dim=1)
 
     prepare = descriptors
 
@@ -121,8 +121,8 @@ class GeometricFeatures(nn.Module):
 
     def point_features(self, prepared: Sequence[Tensor]) -> list[Tensor]:
         """Kernel features ``phi`` ``(P_i, K)`` float32 of prepared scans, before the lift."""
-        values = ((own.to(self.basis.device) - self.centres) / self.spreads for own in prepared)
-        phases = (own @ self.frequencies for own in values)
+        scans = (values.to(self.basis.device) for values in prepared)
+        phases = ((values - self.centres) / self.spreads @ self.frequencies for values in scans)
         root = math.sqrt(self.frequencies.shape[1])
         return [torch.cat([phase.cos(), phase.sin()], dim=1) / root for phase in phases]
 
@@ -141,7 +141,7 @@ def _local_shape(xyz: Tensor, pixel: Tensor) -> tuple[Tensor, Tensor]:
     """Linearity, planarity, sphericity ``(P, 3)`` and normal ``(P, 3)`` of each point's pixel.
 
     The neighbours of a pixel are the nearest returns of the pixels around it, columns wrapping,
-    whose range is close to its own. The statistics are those of the neighbours and the pixel
+    whose range is close to its own. The statistics are over the neighbours and the pixel
     itself; with fewer than three in all, every value is 0.
     """
     rows, columns = _IMAGE.beams, _IMAGE.columns
@@ -158,16 +158,16 @@ def _local_shape(xyz: Tensor, pixel: Tensor) -> tuple[Tensor, Tensor]:
     width = image.shape[2]
     image = image.reshape(4, -1)
     centre = (occupied // columns + pad_rows) * width + occupied % columns + pad_columns
-    own = image[:, centre]
-    gate = _GATE_M + _GATE_SHARE * own[3]
-    count = torch.zeros_like(own[3])
-    first = torch.zeros_like(own[:3])
-    second = own.new_zeros(6, len(centre))
+    centres = image[:, centre]
+    gate = _GATE_M + _GATE_SHARE * centres[3]
+    count = torch.zeros_like(centres[3])
+    first = torch.zeros_like(centres[:3])
+    second = centres.new_zeros(6, len(centre))
     for row_offset in _ROW_OFFSETS:
         for column_offset in _COLUMN_OFFSETS:
             other = image[:, centre + (row_offset * width + column_offset)]
-            near = ((other[3] - own[3]).abs() < gate).float()
-            x, y, z = (other[:3] - own[:3]) * near
+            near = ((other[3] - centres[3]).abs() < gate).float()
+            x, y, z = (other[:3] - centres[:3]) * near
             count += near
             first += torch.stack([x, y, z])
             second += torch.stack([x * x, y * y, z * z, x * y, x * z, y * z])
@@ -182,7 +182,7 @@ def _local_shape(xyz: Tensor, pixel: Tensor) -> tuple[Tensor, Tensor]:
             s3 / s1.clamp_min(1e-9),
         ]
     )
-    normal = normal * torch.where((normal * own[:3]).sum(dim=0) > 0, -1.0, 1.0)
+    normal = normal * torch.where((normal * centres[:3]).sum(dim=0) > 0, -1.0, 1.0)
     both = torch.cat([shape, normal]) * (count >= 3)
     table = xyz.new_zeros(rows * columns, 6)
     table[occupied] = both.T.float()

@@ -21,7 +21,7 @@ class FrozenNetwork(nn.Module):
     """Network that stays in evaluation mode: batch statistics would change its features."""
 
     def train(self, mode: bool = True) -> Self:
-        """Stays in evaluation mode."""
+        """Keep evaluation mode, whatever ``mode`` is."""
         return super().train(False)
 
 
@@ -87,7 +87,7 @@ def load_strictly(
     network.load_state_dict(loaded)
 
 
-def renamed(names: Mapping[str, str]) -> Callable[[str], str]:
+def key_renamer(names: Mapping[str, str]) -> Callable[[str], str]:
     """Return a function that replaces the beginning of a key by the first entry that fits.
 
     Keys of the table are regular expressions, and ``{}`` in their values stands for a group.

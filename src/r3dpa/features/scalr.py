@@ -20,10 +20,10 @@ from torch import Tensor, nn
 from r3dpa.features.geometric import GeometricFeatures, random_basis
 from r3dpa.features.official import (
     FrozenNetwork,
+    key_renamer,
     load_strictly,
     naming,
     read_released,
-    renamed,
 )
 from r3dpa.features.voxels import (
     PointCloudBatch,
@@ -70,7 +70,7 @@ class TokenFeatures(FrozenNetwork):
 
     Args:
         network: Trained network; its head is removed.
-        grid: Preparation of scans, as in its training. Default: that of the release of ScaLR.
+        grid: Preparation of scans, as in its training. Default: as in the release of ScaLR.
     """
 
     name: str
@@ -79,7 +79,9 @@ class TokenFeatures(FrozenNetwork):
         super().__init__()
         grid = grid or ScanGrid()
         if network.cells != grid.cells:
-            raise ValueError(f"network has cells {network.cells}, but grid has {grid.cells}.")
+            raise ValueError(
+                f"network has cells {network.cells}, but grid has {grid.cells}; give both the same"
+            )
         network.head = nn.Identity()
         self.network = network.requires_grad_(False)
         self.grid = grid
@@ -108,10 +110,10 @@ class TokenFeatures(FrozenNetwork):
         if any(counts):
             tokens = F.normalize(self.tokens(collate_scans(prepared).to(device)), dim=1)
         return [
-            own[scan.upsample.to(device)]
-            if len(own)
-            else own.new_zeros(len(scan.upsample), self.network.width)
-            for scan, own in zip(prepared, tokens.split(counts), strict=True)
+            features[scan.upsample.to(device)]
+            if len(features)
+            else features.new_zeros(len(scan.upsample), self.network.width)
+            for scan, features in zip(prepared, tokens.split(counts), strict=True)
         ]
 
     def tokens(self, batch: PointCloudBatch) -> Tensor:
@@ -139,7 +141,7 @@ class ScaLR(TokenFeatures):
         return cls(network, grid)
 
 
-official_name = renamed(_OFFICIAL_NAMES)
+official_name = key_renamer(_OFFICIAL_NAMES)
 
 
 def _network_like(weights: Mapping[str, Tensor], grid: ScanGrid) -> WaffleIron:
@@ -147,7 +149,7 @@ def _network_like(weights: Mapping[str, Tensor], grid: ScanGrid) -> WaffleIron:
         head_dim, width = weights["classif.weight"].shape[:2]
     except KeyError as error:
         raise ValueError(
-            f"holds no WaffleIron with a head (no {error}); give {_RELEASED}."
+            f"holds no WaffleIron with a head (no {error}); give {_RELEASED}"
         ) from error
     layers = [re.match(r"waffleiron\.\w+\.(\d+)\.", key) for key in weights]
     depth = max((int(layer[1]) + 1 for layer in layers if layer), default=1)
@@ -155,11 +157,11 @@ def _network_like(weights: Mapping[str, Tensor], grid: ScanGrid) -> WaffleIron:
 
 
 def _scalr_weights(content: Any) -> dict[str, Tensor]:
-    found = next((key for key in _MODEL_KEYS if isinstance(content, dict) and key in content), None)
-    if found is None or not isinstance(content[found], Mapping):
-        raise ValueError(f"has neither {' nor '.join(_MODEL_KEYS)}; give {_RELEASED}.")
+    name = next((key for key in _MODEL_KEYS if isinstance(content, dict) and key in content), None)
+    if name is None or not isinstance(content[name], Mapping):
+        raise ValueError(f"has neither {' nor '.join(_MODEL_KEYS)}; give {_RELEASED}")
     # "module." comes from DistributedDataParallel.
-    return {key.removeprefix("module."): value for key, value in content[found].items()}
+    return {key.removeprefix("module."): value for key, value in content[name].items()}
 
 
 class WaffleIronS(TokenFeatures):
@@ -170,8 +172,8 @@ class WaffleIronS(TokenFeatures):
     are described in ``README.md`` beside the weights; see :class:`r3dpa.modules.PointPretraining`.
 
     Args:
-        weights: File written by that training. Default: the one that comes with the package.
-        dim: Width D of the features, at least that of the tokens (128 for those shipped).
+        weights: File written by this training. Default: the file shipped with the package.
+        dim: Width D of the features, at least the tokens' width (128 for the shipped weights).
     """
 
     mean: Tensor
@@ -184,7 +186,7 @@ class WaffleIronS(TokenFeatures):
         state, network, grid = _read_weights(Path(weights) if weights else _SHIPPED)
         super().__init__(network, grid)
         if dim < network.width:
-            raise ValueError(f"dim must be at least {network.width}, got {dim}.")
+            raise ValueError(f"dim must be at least {network.width}, got {dim}")
         self.dim = dim
         eps = nn.BatchNorm1d(1).eps
         self.register_buffer("mean", state["norm.running_mean"])
@@ -207,7 +209,7 @@ class WaffleIronS(TokenFeatures):
 
 
 def save_weights(path: Path, network: WaffleIron, norm: nn.BatchNorm1d, grid: ScanGrid) -> None:
-    """Writes what :class:`WaffleIronS` reads; ``norm`` has the statistics of the tokens."""
+    """Write what :class:`WaffleIronS` reads; ``norm`` has the statistics of the tokens."""
     state = {f"network.{key}": value for key, value in network.state_dict().items()}
     state |= {f"norm.{key}": value for key, value in norm.state_dict().items()}
     state = {key: value.detach().cpu().contiguous() for key, value in state.items()}
@@ -227,13 +229,13 @@ def _read_weights(path: Path) -> tuple[dict[str, Tensor], WaffleIron, ScanGrid]:
         }
         grid = ScanGrid(**settings)
         network = WaffleIron(about["width"], about["depth"], grid.cells)
-        own = [key for key in state if key.startswith("network.")]
-        network.load_state_dict({key.removeprefix("network."): state[key] for key in own})
+        keys = [key for key in state if key.startswith("network.")]
+        network.load_state_dict({key.removeprefix("network."): state[key] for key in keys})
     except (*UNPICKLING_ERRORS, SafetensorError) as error:
         raise ValueError(
             f"{path} holds no weights of waffleiron-s ({first_line(error)}): give the "
             "waffleiron_s.safetensors that a training with PointPretraining wrote, or leave "
-            "weights out for those of the package."
+            "weights out to use the file shipped with the package"
         ) from error
     return state, network, grid
 
@@ -246,24 +248,24 @@ def feature_source(name: str, ckpt: str | Path | None = None, dim: int = 768) ->
             ``"waffleiron-s"``: trained on simulated scans without labels; ``"geometric"``: local
             shape, without training.
         ckpt: Weights of ``"scalr"`` or ``"waffleiron-s"``; the latter has default weights.
-        dim: Width D of the features; of ``"scalr"`` that of its checkpoint.
+        dim: Width D of the features; for ``"scalr"``, the width of its checkpoint.
     """
     if name not in SOURCES:
-        raise ValueError(f"there is no feature source {name!r}; there are {', '.join(SOURCES)}.")
+        raise ValueError(f"unknown feature source {name!r}; choose from {', '.join(SOURCES)}")
     if name == "scalr":
         if ckpt is None:
             raise ValueError(
                 "feature source scalr needs ckpt, the released ckpt_last.pth; without it, choose "
-                f"one of {', '.join(SOURCES[1:])}."
+                f"from {', '.join(SOURCES[1:])}"
             )
         scalr = ScaLR.from_checkpoint(ckpt)
         if scalr.dim != dim:
-            raise ValueError(f"{ckpt} has features of width {scalr.dim}, but dim is {dim}.")
+            raise ValueError(f"{ckpt} has features of width {scalr.dim}, but dim is {dim}")
         return scalr
     if name == "waffleiron-s":
         return WaffleIronS(None if ckpt is None else Path(ckpt), dim=dim)
     if ckpt is not None:
-        raise ValueError(f"feature source {name} has no weights: leave ckpt ({ckpt}) out.")
+        raise ValueError(f"feature source {name} has no weights: leave ckpt ({ckpt}) out")
     return GeometricFeatures(dim)
 
 

@@ -37,7 +37,7 @@ _BLOCK_RAD = (math.radians(28 / 8), 2 * math.pi / 64)
 
 @dataclass(frozen=True)
 class ScanGrid:
-    """Settings that thin, crop and grid a scan; the defaults are those of ScaLR.
+    """Settings that thin, crop and grid a scan; the defaults are ScaLR's.
 
     Args:
         minimum_m: Lowest x, y, z of the field of view, metres in the sensor frame.
@@ -60,12 +60,12 @@ class ScanGrid:
     def __post_init__(self) -> None:
         for name in ("cell_m", "voxel_m", "num_neighbors", "intensity_std"):
             if not np.all(np.greater(getattr(self, name), 0)):
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}.")
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
         extent = np.subtract(self.maximum_m, self.minimum_m)
         if (extent <= 0).any() or not np.allclose(extent, np.multiply(self.cells, self.cell_m)):
             raise ValueError(
                 f"the field of view {self.minimum_m} to {self.maximum_m} m must be a whole number "
-                f"of cells of {self.cell_m} m along each axis."
+                f"of cells of {self.cell_m} m along each axis"
             )
 
     @property
@@ -101,12 +101,12 @@ class PointCloudBatch(NamedTuple):
     num_points: Tensor  #: ``(B,)`` int64 points of each scan; their sum is N
 
     def to(self, device: torch.device | str) -> Self:
-        """The same batch on another device."""
+        """Return the batch on another device."""
         return type(self)(*(values.to(device, non_blocking=True) for values in self))
 
 
 def prepare_scan(points: np.ndarray | Tensor, grid: ScanGrid | None = None) -> PreparedScan:
-    """Thinned, cropped and indexed scan.
+    """Thin, crop and index a scan.
 
     Each voxel keeps its point of lowest index; voxels are counted from the lowest x, y, z of the
     scan and sorted by (x, y, z). Of these points, those within the field of view are kept. The
@@ -123,11 +123,11 @@ def prepare_scan(points: np.ndarray | Tensor, grid: ScanGrid | None = None) -> P
         points = points.detach().cpu().numpy()
     points = np.asarray(points, dtype=np.float32)
     if points.ndim != 2 or points.shape[1] != 4:
-        raise ValueError(f"points must be (P, 4) x, y, z, intensity, got {points.shape}.")
+        raise ValueError(f"points must be (P, 4) x, y, z, intensity, got {points.shape}")
     if not np.isfinite(points).all():
         raise ValueError(
             f"{(~np.isfinite(points).all(axis=1)).sum()} of {len(points)} points are NaN or "
-            "infinite: drop them first."
+            "infinite: drop them first"
         )
     minimum, maximum = np.array([grid.minimum_m, grid.maximum_m], dtype=np.float32)
     kept = _one_per_voxel(points[:, :3], grid.voxel_m)
@@ -189,12 +189,12 @@ class MaskedScan(NamedTuple):
 
 @dataclass(frozen=True)
 class Masking:
-    """Rotates scans about z and mirrors them at random, hides blocks of rays, describes all points.
+    """Random rotation about z, mirroring and hidden blocks of rays, with descriptors as targets.
 
     Args:
         grid: Preparation of scans.
-        max_hidden: Upper limit, below 1, of the share of hidden blocks, which is drawn for each
-            scan from 0 on, so that training includes whole scans.
+        max_hidden: Upper limit, below 1, of the share of hidden blocks. The share is uniform from
+            0 for each scan, so that training includes whole scans.
     """
 
     grid: ScanGrid = field(default_factory=ScanGrid)
@@ -202,7 +202,7 @@ class Masking:
 
     def __post_init__(self) -> None:
         if not 0 <= self.max_hidden < 1:
-            raise ValueError(f"max_hidden must be at least 0 and below 1, got {self.max_hidden}.")
+            raise ValueError(f"max_hidden must be at least 0 and below 1, got {self.max_hidden}")
 
     def __call__(self, points: Tensor, rng: np.random.Generator) -> MaskedScan:
         """Random view of the points ``(P, 4)``: x, y, z in metres, intensity 0..1."""

@@ -24,7 +24,7 @@ _BLOCK = 1024  # points
 
 
 class WaffleIron(nn.Module):
-    """Tokens of all points from their features, neighbours and cells.
+    """Network that computes a token for each point from its features, neighbours and cells.
 
     ``depth`` layers, each a spatial mixing on one plane (xy, xz, yz, xy, ...) and a channel mixing
     of each token. The default sizes are WI-48-768, the backbone of ScaLR.
@@ -60,7 +60,7 @@ class WaffleIron(nn.Module):
         return self.mix(self.embedding(batch.features, batch.neighbors), batch)
 
     def mix(self, tokens: Tensor, batch: PointCloudBatch, visible: Tensor | None = None) -> Tensor:
-        """Tokens ``(N, F)`` of the last layer, from those of the first.
+        """Tokens ``(N, F)`` of the last layer, from the tokens of the first.
 
         Points that are not ``visible`` ``(N,)`` read the planes but write nothing there, so that no
         point depends on them.
@@ -76,11 +76,12 @@ class WaffleIron(nn.Module):
         weight = None if visible is None else visible.to(batch.features.dtype)[:, None]
         planes = []
         for cells, (rows, columns) in zip(batch.cells, self.plane_sizes, strict=True):
-            own = cells + scan * (rows * columns)
+            index = cells + scan * (rows * columns)
             count = batch.features.new_zeros(num_scans * rows * columns)
-            count.index_add_(0, own, count.new_ones(num_points) if weight is None else weight[:, 0])
+            ones = count.new_ones(num_points)
+            count.index_add_(0, index, ones if weight is None else weight[:, 0])
             share = (count + _COUNT_EPS).reciprocal()[:, None]
-            planes.append(Plane(own, share, (num_scans, rows, columns), weight))
+            planes.append(Plane(index, share, (num_scans, rows, columns), weight))
         return planes
 
 
@@ -118,18 +119,18 @@ class Embedding(nn.Module):
             others = features.index_select(0, neighbors.flatten())
             offsets = others - features.repeat_interleave(neighbors.shape[1], dim=0)
             around = self._around(offsets).unflatten(0, neighbors.shape).amax(dim=1)
-        else:  # one after the other in blocks that fit the caches: a K-th of the memory
+        else:  # one neighbour at a time, in blocks that fit the caches: 1 / K of the memory
             around = torch.cat(
                 [
-                    reduce(torch.maximum, (self._around(features[i] - own) for i in others.T))
-                    for own, others in zip(
+                    reduce(torch.maximum, (self._around(features[i] - values) for i in others.T))
+                    for values, others in zip(
                         features.split(_BLOCK), neighbors.split(_BLOCK), strict=True
                     )
                 ]
             )
         with no_autocast(features.device):
-            own = self.point(features)
-            return self.merge(torch.cat([own, around.to(own.dtype)], dim=1))
+            point_features = self.point(features)
+            return self.merge(torch.cat([point_features, around.to(point_features.dtype)], dim=1))
 
     def _around(self, offsets: Tensor) -> Tensor:
         with no_autocast(offsets.device):

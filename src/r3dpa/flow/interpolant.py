@@ -61,8 +61,8 @@ class Interpolant:
     def coefficients(self, time: Tensor) -> PathCoefficients:
         """Path coefficients at times in [0, 1] of any shape, in their shape and dtype."""
         if self.path == "linear":
-            one = torch.ones_like(time)
-            return PathCoefficients(1 - time, time, -one, one)
+            ones = torch.ones_like(time)
+            return PathCoefficients(1 - time, time, -ones, ones)
         quarter = math.pi / 2
         cosine, sine = torch.cos(quarter * time), torch.sin(quarter * time)
         return PathCoefficients(cosine, sine, -quarter * sine, quarter * cosine)

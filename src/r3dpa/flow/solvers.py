@@ -299,8 +299,7 @@ def _corrected_bend(width: float, ratio: float, past_change: Tensor, change: Ten
     """Mean of D over a finished step minus its start, by the parabola in lambda through three D.
 
     The mean is weighted by ``exp(lambda)``. ``width`` and ``ratio`` are ``h`` and ``h / h0`` of the
-    step, 0 if the step before is not known; the changes of D are those of the step before and of
-    the step.
+    step, 0 if the step before is not known; D changes over the step before and over this step.
     """
     if ratio == 0:
         return change / 2

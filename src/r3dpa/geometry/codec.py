@@ -73,7 +73,8 @@ class RangeCodec:
     all clipped to [-1, 1]; a pixel without a return is -1 or counts as d = 0. With
     ``return_channel`` a second channel is 1 at returns and -1 at empty pixels, so that a decoder
     does not blur the border between the two into ghost points. With ``reflectance`` the second
-    channel is that of the returns instead, from [0, 1] to [-1, 1], and -1 without a return.
+    channel is the reflectance of the returns instead, mapped from [0, 1] to [-1, 1], and -1
+    without a return.
 
     After range and return there may be two further channels: with ``intensity_channel`` the
     intensity, from [0, 1] to [-1, 1]; with ``num_classes`` the number of the class of a return, see
@@ -125,8 +126,8 @@ class RangeCodec:
             raise ValueError(
                 f"codec.num_classes must be {NUM_CLASSES}, or 0 for none, got {self.num_classes}"
             )
-        # So that a codec equals the same one written out. Not the number in place of None: the
-        # scale of a default codec would stay when a YAML file names another encoding alone.
+        # Store a default scale as None: equal codecs compare equal, and a YAML that changes only
+        # `encoding` gets the default scale of that encoding.
         if self.scale == _DEFAULT_SCALES[self.encoding]:
             object.__setattr__(self, "scale", None)
         if not 0.0 < self._divisor < math.inf:

@@ -191,7 +191,7 @@ def points_of(
     """Points of the pixels ``(H, W)`` that hold a return, row after row.
 
     They are ``(P, 3)`` metres, or ``(P, 4)`` with the ``intensity`` ``(H, W)`` of the pixels.
-    Within a row the order is that of the image, or for rings that of a scan, whose azimuth grows
+    A row is in the order of the image, or for rings in the order of a scan, whose azimuth grows
     from 0, so that a written file can be read with the same projection. Otherwise as
     :func:`unproject`.
     """

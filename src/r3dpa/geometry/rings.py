@@ -34,7 +34,7 @@ class RingProjection:
     The lasers of a real sensor neither start at one point nor have one pitch, so that rows of
     equal pitch leave many pixels empty; one row per laser fills them. The ring of a point
     follows from its place in the file: the highest ring comes first, azimuth grows and each
-    ring starts at azimuth 0, as in KITTI. Columns are those of :class:`SphericalProjection`. A
+    ring starts at azimuth 0, as in KITTI. Columns as in :class:`SphericalProjection`. A
     point clipped off the vertical field of view cannot exist here; the inclination limits of
     the sensor only tell scans in ring order from others.
 
@@ -149,8 +149,8 @@ class RingProjection:
         beam = match_in_order(measured, known)
         out_of_place = (measured - known[beam]).abs().median()
         if out_of_place > _OUT_OF_PLACE_SHARE * self.sensor.field_of_view_rad:
-            found = f"rings lie {out_of_place.rad2deg():.1f} degrees from the beam of their place"
-            raise not_in_ring_order(found, self.sensor)
+            reason = f"rings lie {out_of_place.rad2deg():.1f} degrees from the beam of their place"
+            raise not_in_ring_order(reason, self.sensor)
         return beam.to(ring.device)[ring]
 
     def _inclinations(self) -> Tensor:

@@ -73,7 +73,7 @@ def scene_metrics(
 
 
 def metrics_by_name(metrics: MetricCollection) -> dict[str, Any]:
-    """Return the metrics by name; those of a feature space share their states."""
+    """Return the metrics by name; metrics of one feature space share their states."""
     by_name: dict[str, Any] = dict(metrics.items(keep_base=True, copy_state=False))
     return {name: by_name[name] for group in metrics.compute_groups.values() for name in group}
 

@@ -115,7 +115,7 @@ class SceneMetric(Metric):
         """Set one of :meth:`real_states`.
 
         Raises:
-            ValueError: If the shape differs from that of the state.
+            ValueError: If the shape differs from the state's shape.
         """
         if name in self._no_rows:
             expected = (len(value), *self._no_rows[name].shape[1:])

@@ -278,7 +278,7 @@ def reference_spaces(
 
     Args:
         statistics: The reference.
-        names: Spaces; default: those of the reference that need no weights, or have them.
+        names: Spaces; default: all of the reference that need no weights, or have them.
         ckpt: Official weights by space.
         device: Device of the networks.
         protocol: Expected protocol of the reference; None for any.

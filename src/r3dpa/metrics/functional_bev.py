@@ -55,7 +55,7 @@ class BEVGrid:
         if len(inside) == 0:
             raise ValueError(
                 f"{name}: none of {len(points)} points has x and y within {self.half_m:g} m; "
-                "check the unit and the frame, or leave the cloud out and say so"
+                "check the unit and the frame, or leave the cloud out and report it"
             )
         return inside
 
@@ -81,7 +81,9 @@ def _checked_points(points: Tensor, name: str) -> Tensor:
     if points.ndim != 2 or points.shape[1] < 3:
         raise ValueError(f"{name}: expected points (P, 3 or more), got {tuple(points.shape)}")
     if len(points) == 0:
-        raise ValueError(f"{name} has no point; leave it out and say so, or repair the generator")
+        raise ValueError(
+            f"{name} has no point; leave it out and report it, or repair the generator"
+        )
     broken = ~torch.isfinite(points[:, :3]).all(dim=1)
     if broken.any():
         raise ValueError(

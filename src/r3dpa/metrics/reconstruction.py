@@ -188,7 +188,7 @@ class LabelQuality(Metric):
             self.num_intensities += both.sum()
 
     def compute(self) -> dict[str, float]:
-        """Return the figures by name; those of channels that were not given are left out."""
+        """Return the figures by name, without channels that were not given."""
         figures = {}
         iou = class_iou(self.confusion)
         if not iou.isnan().all():

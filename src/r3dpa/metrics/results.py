@@ -73,7 +73,7 @@ _LATEX: dict[Mark, str] = {
 class MetricResult:
     """One number of an evaluation.
 
-    The 95 % interval is the spread of the value over draws of this many generated scenes, compared
+    The 95 % interval is the spread of the value over draws of as many generated scenes, compared
     with the same real scans, unless the note names another. It is not corrected for the bias of few
     scenes, except for extrapolated values, and too wide where the value is mostly such a bias.
     """
@@ -244,7 +244,7 @@ class EvaluationTable:
 
     @cached_property
     def columns(self) -> dict[str, list[MetricResult | None]]:
-        """Results of each metric that has a value, one per evaluation; those of the paper first."""
+        """Results of each metric that has a value, one per evaluation; the paper's first."""
         names = list(PUBLISHED_SCALES)
         for evaluation in self.evaluations:
             names += [row.name for row in evaluation.rows if row.name not in names]

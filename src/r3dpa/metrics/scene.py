@@ -124,8 +124,8 @@ def through_sensor(scene: EvaluationScene, protocol: Protocol) -> EvaluationScen
     if not (range_m > 0).any():
         raise ValueError(
             f"{scene.name}: no pixel of the range image lies within the sensor's range "
-            f"{sensor.range_min_m:g}..{sensor.range_max_m:g} m; leave it out and say so, or check "
-            "its unit"
+            f"{sensor.range_min_m:g}..{sensor.range_max_m:g} m; leave it out and report it, or "
+            "check its unit"
         )
     points = points_of(range_m, projection, protocol.unprojection == "corner")
     return EvaluationScene(scene.name, points, range_m, intensity)
@@ -160,6 +160,6 @@ def _finite(name: str, what: str, values: Tensor) -> Tensor:
     if broken := int((~values.isfinite()).sum()):
         raise ValueError(
             f"{name}: {what} holds {broken} NaN or infinite values; repair the generator, or leave "
-            "the scene out and say so"
+            "the scene out and report it"
         )
     return values

@@ -429,6 +429,6 @@ def check_image(vae: VAE, codec: RangeCodec) -> None:
     of_codec += f"num_classes {codec.num_classes}"
     if of_vae != of_codec:
         raise ValueError(
-            f"the VAE is one of images with {of_vae}, but --data.init_args.codec gives {of_codec}: "
+            f"the VAE is for images with {of_vae}, but --data.init_args.codec gives {of_codec}: "
             "set in_channels, intensity and num_classes of --model.init_args.vae to the latter"
         )

@@ -65,9 +65,9 @@ class FeatureExtraction(LightningModule):
 
     def predict_dataloader(self) -> DataLoader[Any]:
         """The share of this process, in order; no scan is given twice."""
-        own = self.scans[self.trainer.global_rank :: self.trainer.world_size]
+        scans = self.scans[self.trainer.global_rank :: self.trainer.world_size]
         sensor = cast(Projection, self.projection).sensor
-        dataset = PointDataset(own, sensor, self.extractor.prepare)
+        dataset = PointDataset(scans, sensor, self.extractor.prepare)
         # Of one process, so that Lightning does not divide the share once more.
         sampler: DistributedSampler[Any] = DistributedSampler(dataset, 1, 0, shuffle=False)
         return plain_loader(

@@ -134,9 +134,9 @@ class FewStep(FlowMatching):
         items = [_Noise(i, name, cache.folder, (name, 0, 0)) for i, name in enumerate(names)]
         size = trainer.datamodule.batch_size
 
-        def points(own: list[_Noise]) -> Iterator[Tensor]:
-            for first in range(0, len(own), size):
-                indices = [item.index for item in own[first : first + size]]
+        def points(noises: list[_Noise]) -> Iterator[Tensor]:
+            for first in range(0, len(noises), size):
+                indices = [item.index for item in noises[first : first + size]]
                 with trainer.precision_plugin.forward_context():
                     rows = self.solve(indices)
                 yield rows

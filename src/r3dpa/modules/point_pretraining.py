@@ -67,7 +67,7 @@ class PointPretraining(LightningModule):
         if not isinstance(masking, Masking):
             raise ValueError(
                 "PointPretraining needs r3dpa.data.PointDataModule with prepare "
-                f"r3dpa.features.Masking, got {masking!r}."
+                f"r3dpa.features.Masking, got {masking!r}"
             )
         if masking.grid.cells != self.network.cells:
             raise ValueError(

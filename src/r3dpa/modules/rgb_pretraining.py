@@ -96,7 +96,7 @@ class RGBPretraining(ImageStage):
         check_trainer(self.trainer)
         size = self.images.image_size
         check_latents(self.vae, self.sit, (size, size))
-        if stage == "fit" and not all(one.trained for one in self._teacher):
+        if stage == "fit" and not all(network.trained for network in self._teacher):
             raise ValueError(
                 "the teacher has random weights: give --model.init_args.teacher.init_args.weights "
                 "the file of a trained one, such as dinov2_vitb14_pretrain.pth, or train without "

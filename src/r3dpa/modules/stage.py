@@ -358,7 +358,7 @@ class Stage(L.LightningModule, ABC):
             if theirs != ours:
                 raise ValueError(
                     f"{source} was trained on other range images: {name} {theirs} there, {ours} "
-                    "here. Set sensor, projection and codec of the data module to those of the "
+                    "here. Set sensor, projection and codec of the data module as in the "
                     "checkpoint"
                 )
 

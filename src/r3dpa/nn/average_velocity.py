@@ -76,9 +76,9 @@ class AverageVelocitySiT(SiT):
 
     def with_average(self, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Weights of a :class:`SiT` with the copies that this network adds."""
-        own = self.state_dict()
+        state = self.state_dict()
         first = len(self.blocks) - len(self.average.blocks)
-        added = {key: own[key] for key in own if key.startswith("average.embedder.")}
+        added = {key: state[key] for key in state if key.startswith("average.embedder.")}
         for key, value in weights.items():
             kind, _, rest = key.partition(".")
             index, _, name = rest.partition(".")

@@ -258,8 +258,8 @@ class SyncedBatchNorm2d(nn.BatchNorm2d):
 
     With one process it equals ``nn.BatchNorm2d`` bitwise; the state-dict keys are the same. Unlike
     ``nn.SyncBatchNorm`` it also runs on a CPU (gloo), and batch sizes may differ between
-    processes. The variance takes two passes around the global mean, in float32. Gradients are those
-    of the sum of the losses of all processes. A batch with non-finite statistics leaves the running
+    processes. The variance takes two passes around the global mean, in float32. Gradients come from
+    the sum of the losses of all processes. A batch with non-finite statistics leaves the running
     statistics unchanged.
     """
 

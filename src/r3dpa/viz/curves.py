@@ -75,8 +75,8 @@ def read_metrics(path: str | Path) -> dict[str, Series]:
 def read_curves(run: Path) -> dict[str, Series]:
     """Quantities of a training by step, from the ``version_*/metrics.csv`` of each start.
 
-    Where a start repeats steps of an earlier one its values count. Files of ``r3dpa validate``,
-    which have no training losses, are left out.
+    Where a start repeats steps of an earlier one, its values replace the earlier ones. Files of
+    ``r3dpa validate``, which have no training losses, are left out.
     """
     curves: dict[str, dict[float, float]] = {}
     paths = run.glob("version_*/metrics.csv")

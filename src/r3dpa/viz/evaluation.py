@@ -41,7 +41,7 @@ def bev_histograms(samples: Array, references: Array, half_m: float = 50.0) -> F
     side = len(samples)
     step = math.ceil(side / MAX_CELLS)
     cell_m = step * 2 * half_m / side
-    counts = [_summed(as_numpy(cells, ("X", "X")), step) for cells in (samples, references)]
+    counts = [_sum_cells(as_numpy(cells, ("X", "X")), step) for cells in (samples, references)]
     drawn, real = (cells / cells.sum() for cells in counts)
     # The last cells may reach beyond the limits, where the axes end.
     end_m = len(drawn) * cell_m - half_m
@@ -158,7 +158,7 @@ def save_figures(
     save(matches_figure(best, worst, sensor), folder / "matches.png")
 
 
-def _summed(values: NDArray[np.float64], step: int) -> NDArray[np.float64]:
+def _sum_cells(values: NDArray[np.float64], step: int) -> NDArray[np.float64]:
     """Sums over squares of cells; the last squares may be cut off by the border."""
     first = range(0, len(values), step)
     return np.add.reduceat(np.add.reduceat(values, first, axis=0), first, axis=1)

@@ -42,7 +42,7 @@ def fit_colours(features: Array) -> Callable[[Array], NDArray[np.float64]]:
     """
     fitted = _rows(features)
     width = fitted.shape[1]
-    fitted = fitted[_filled(fitted)]
+    fitted = fitted[_occupied_cells(fitted)]
     mean, loadings = np.zeros(width, fitted.dtype), np.zeros((width, 0), fitted.dtype)
     low = high = np.zeros(0)
     if len(fitted):
@@ -62,7 +62,7 @@ def fit_colours(features: Array) -> Callable[[Array], NDArray[np.float64]]:
         share = np.full((len(rows), 3), 0.5)
         share[:, : len(low)] = ((rows - mean) @ loadings - low) / (high - low)
         colours = DARKEST_FEATURE + (1 - DARKEST_FEATURE) * np.clip(share, 0, 1)
-        colours[~_filled(rows)] = 0.0
+        colours[~_occupied_cells(rows)] = 0.0
         return colours
 
     return colours_of
@@ -83,7 +83,7 @@ def similarity_picture(
     """
     values = _rows(grid)
     (row, column), (rows, columns) = cell, grid_size
-    filled = _filled(values)
+    filled = _occupied_cells(values)
     chosen = row * columns + column
     if not filled[chosen]:
         raise ValueError(f"cell {cell} is empty; choose one that holds points")
@@ -159,5 +159,5 @@ def _rows(features: Array) -> Rows:
     return features.astype(np.result_type(features.dtype, np.float32), copy=False)
 
 
-def _filled(rows: Rows) -> NDArray[np.bool_]:
+def _occupied_cells(rows: Rows) -> NDArray[np.bool_]:
     return np.any(rows != 0, axis=1)

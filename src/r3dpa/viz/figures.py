@@ -189,7 +189,7 @@ def edit_sheet(
     pictures = []
     for row in rows:
         picture = range_image_picture(row.range_m, projection.sensor)
-        tinted = picture if row.parts is None else _tinted(picture, row.parts, part_names)
+        tinted = picture if row.parts is None else _tint_parts(picture, row.parts, part_names)
         pictures.append((row.name, tinted))
     figure, cells = strip_sheet(pictures, projection.sensor, 0.3 if part_names else 0.0)
     for row, axes in zip(rows, cells, strict=True):
@@ -252,7 +252,7 @@ def _azimuth_ticks(axes: Axes, projection: Projection) -> None:
     axes.tick_params(length=2, pad=2)
 
 
-def _tinted(picture: Pixels, parts: NDArray[np.integer], names: Sequence[str]) -> Pixels:
+def _tint_parts(picture: Pixels, parts: NDArray[np.integer], names: Sequence[str]) -> Pixels:
     """The picture in grey, tinted by part except where it is ``kept``."""
     picture = (picture @ np.array(_GREY_SHARES))[..., None]
     over = np.array([to_rgb(colour) for colour in part_colours(names)])[parts]

@@ -100,9 +100,9 @@ def scan_page(
         title: Shown on top.
         semantics: Categories of the labels by number; other numbers are shown as such.
         origins: Categories of the origins by number, likewise.
-        beside: Scan beside each scan, or one that stays beside all, seen by the same camera.
-        sensor: Gives the limits of the range colours; the default sensor if None.
-        gallery: Tiles by heading, shown in a column beside the cloud; none if None.
+        beside: Scan to show beside each scan, or one for all, seen by the same camera.
+        sensor: Gives the limits of the range colours; default: the default sensor.
+        gallery: Tiles by heading, shown in a column beside the cloud; default: no column.
         about: Lines on top of that column.
         mode: Colours at first: ``height``, ``range``, ``intensity``, ``semantic`` or ``origin``.
 
@@ -172,11 +172,14 @@ def edit_page(
 
     Args:
         before: Range images ``(H, W)`` of the scans by name, may be empty; shown after the results.
-        after: Those of the results; images without a return are left out, a ``ValueError`` if all.
-        parts: ``(H, W)`` part number of each pixel, for the colours; None for none.
+        after: Range images of the results. Images without a return are left out.
+        parts: ``(H, W)`` part number of each pixel, for the colours; default: no parts.
         part_names: Names of the parts by number.
         projection: Makes the points.
-        title: Of the page.
+        title: Title of the page.
+
+    Raises:
+        ValueError: If no image has a return.
     """
     order = projection.column_order()
     shown = []
@@ -188,7 +191,7 @@ def edit_page(
             shown.append(PageScan(name, points_of(image, projection), labels))
     named = zip(part_names, part_colours(part_names), strict=True)
     categories = {number: Category(*part) for number, part in enumerate(named)}
-    first = next((one for one in shown if one.name in before), None)
+    first = next((scan for scan in shown if scan.name in before), None)
     beside = None if first is None else [replace(first, name=f"before: {first.name}")]
     return scan_page(shown, title, categories, {}, beside, projection.sensor)
 

@@ -23,7 +23,7 @@ const Cloud = (() => {
     return Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
   }
 
-  /** Cloud of one packed scan; the columns and their order are those of `pack_scan` in page.py. */
+  /** Cloud of one packed scan; the columns and their order are as in `pack_scan` of page.py. */
   async function unpack(header, base64) {
     const zipped = new Blob([bytesOf(base64)]).stream();
     const stream = zipped.pipeThrough(new DecompressionStream("deflate"));

@@ -91,7 +91,7 @@
       this.projection = Cloud.projectionOf(state.camera, width, height);
       this.drawGround();
       const size = state.size * this.ratio;
-      // Range colours tell the distance themselves and must stay those of the legend.
+      // Range colours show the distance themselves and must match the legend.
       const fade = state.mode === "range" ? null : page.background;
       Cloud.drawPoints(this.frame, this.projection, this.cloud, this.colours, size, fade);
       this.canvas.getContext("2d").putImageData(this.image, 0, 0);

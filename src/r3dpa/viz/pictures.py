@@ -92,8 +92,8 @@ def scene_3d(
 ) -> Pixels:
     """Points seen by a pinhole camera behind and above the ego vehicle, looking forward.
 
-    Near points hide far ones and are drawn larger; colours fade with distance. Arguments are those
-    of :func:`birds_eye_picture`; ``size`` is rows and columns of the picture, ``(*size, 3)`` uint8.
+    Near points hide far ones and are drawn larger; colours fade with distance. Arguments as in
+    :func:`birds_eye_picture`; ``size`` is rows and columns of the picture, ``(*size, 3)`` uint8.
     """
     xyz, rgb = _coloured_points(points, colours)
     height, width = 2 * size[0], 2 * size[1]  # averaged over 2 x 2 at the end, against jagged edges
@@ -124,9 +124,12 @@ def scene_3d(
 
 
 def save(picture: Figure | Pixels, path: str | Path) -> Path:
-    """Writes a figure, or pixels ``(rows, columns[, 3])``, atomically; returns ``path``.
+    """Write a figure, or pixels ``(rows, columns[, 3])``, atomically; return ``path``.
 
-    The suffix names the format; another than the known ones raises a ``ValueError``.
+    The suffix names the format.
+
+    Raises:
+        ValueError: If the format is unknown.
     """
     with atomic_path(path := Path(path)) as temporary:
         if isinstance(picture, Figure):

@@ -71,7 +71,8 @@ _ON_SHEET, _ON_PAGE = 16, 8
 
 def draw_scene(out: Path, index: int, range_m: Tensor, geometry: ScanGeometry) -> None:
     """Draw pictures of a scene ``(H, W)``: range image, from above and from behind."""
-    sensor, points = geometry.projection.sensor, points_of(range_m, geometry.projection)
+    sensor = geometry.projection.sensor
+    points = points_of(range_m, geometry.projection)
     picture = range_image_picture(range_m, sensor, scale=max(1, 1024 // sensor.columns))
     save(picture, out / "range" / f"{index:06d}.png")
     save(birds_eye_view(points), out / "birds_eye" / f"{index:06d}.png")
@@ -117,7 +118,7 @@ def write_page(
 ) -> Path:
     """Write a page of point clouds, coloured by the classes and origins of the simulator too.
 
-    ``origins`` are further ones; ``options`` those of :func:`r3dpa.viz.scan_page`.
+    ``origins`` are further ones; ``options`` go to :func:`r3dpa.viz.scan_page`.
     """
     made_by = _categories(Origin) | dict(origins or {})
     page = scan_page(scans, title, _categories(Semantic), made_by, **options)

@@ -23,10 +23,10 @@ from r3dpa.features.dinov2 import (
 )
 from r3dpa.features.official import (
     FrozenNetwork,
+    key_renamer,
     load_strictly,
     naming,
     read_state_dict,
-    renamed,
 )
 
 _NORM_EPS = 1e-6
@@ -84,7 +84,7 @@ class LIPLoc(FrozenNetwork):
             sizes = _sizes(weights)
             heads = usual_heads(sizes["width"]) if num_heads is None else num_heads
             network = cls(**sizes, num_heads=heads)
-            load_strictly(network, weights, renamed(_NAMES))
+            load_strictly(network, weights, key_renamer(_NAMES))
         return network
 
     def forward(self, range_m: Tensor) -> Tensor:

@@ -52,7 +52,7 @@ class ConvNorm(nn.Module):
         return self.norm(self.conv(features, kernel_map))
 
 
-class Residual(nn.Module):
+class SparseResidual(nn.Module):
     """Two convolutions of size 3 beside a shortcut, which has weights if the width changes."""
 
     def __init__(self, in_channels: int, out_channels: int) -> None:
@@ -68,7 +68,7 @@ class Residual(nn.Module):
         return functional.relu(self.second(inner, kernel_map) + self.skip(features), inplace=True)
 
 
-class Stage(nn.Module):
+class ResolutionStage(nn.Module):
     """Change of the stride to ``resampled`` channels, then two residual blocks.
 
     The blocks also read ``joined`` channels of the encoder.
@@ -78,7 +78,10 @@ class Stage(nn.Module):
         super().__init__()
         self.resample = ConvNorm(in_channels, resampled, 2)
         self.blocks = nn.ModuleList(
-            [Residual(resampled + joined, out_channels), Residual(out_channels, out_channels)]
+            [
+                SparseResidual(resampled + joined, out_channels),
+                SparseResidual(out_channels, out_channels),
+            ]
         )
 
     def forward(
@@ -116,10 +119,12 @@ class MinkowskiNet(nn.Module):
         self.encoder, self.decoder = nn.ModuleList(), nn.ModuleList()
         for index in range(_DEPTH):
             before, width = self.widths[index : index + 2]
-            self.encoder.append(Stage(before, before, 0, width))
+            self.encoder.append(ResolutionStage(before, before, 0, width))
         for index in range(_DEPTH):
             before, width = self.widths[_DEPTH + index : _DEPTH + index + 2]
-            self.decoder.append(Stage(before, width, self.widths[_DEPTH - 1 - index], width))
+            self.decoder.append(
+                ResolutionStage(before, width, self.widths[_DEPTH - 1 - index], width)
+            )
         self.head = nn.Linear(self.widths[-1], num_classes)
 
     @classmethod
@@ -251,7 +256,7 @@ class SPVCNN(MinkowskiNet):
         )
 
     def forward(self, coordinates: Tensor, features: Tensor) -> Tensor:
-        """As of :class:`MinkowskiNet`, but rows of one voxel are averaged."""
+        """Run as :class:`MinkowskiNet` does, but average the rows of one voxel."""
         points = self._points(coordinates)
         voxels, _ = Voxels.from_coordinates(points.voxel_of(1))
         stem = self._stem(to_voxels(features, points, voxels), voxels)

@@ -67,8 +67,8 @@ class RangeNet(FrozenNetwork):
             narrow, wide = widths[level - 1], widths[level]
             down = nn.Conv2d(narrow, wide, 3, (1, 2), padding=1, bias=False)
             up = nn.ConvTranspose2d(wide, narrow, (1, 4), (1, 2), padding=(0, 1))
-            self.add_module(f"enc{level}", _Level(down, num_blocks))
-            self.add_module(f"dec{level}", _Level(up, 1))
+            self.add_module(f"enc{level}", _DarknetLevel(down, num_blocks))
+            self.add_module(f"dec{level}", _DarknetLevel(up, 1))
         self.head: nn.Module | None = None
         if num_classes:
             self.head = nn.Sequential(nn.Identity(), nn.Conv2d(_WIDTH, num_classes, 3, padding=1))
@@ -205,14 +205,16 @@ def _activated(layer: nn.Conv2d | nn.ConvTranspose2d) -> nn.Sequential:
     return nn.Sequential(layer, nn.BatchNorm2d(layer.out_channels), nn.LeakyReLU(0.1))
 
 
-class _Level(nn.Module):
+class _DarknetLevel(nn.Module):
     """A convolution that changes the width, and residual blocks."""
 
     def __init__(self, layer: nn.Conv2d | nn.ConvTranspose2d, num_blocks: int) -> None:
         super().__init__()
         self.conv = _activated(layer)
         inside, width = layer.in_channels, layer.out_channels
-        self.residual_blocks = nn.ModuleList(_Residual(inside, width) for _ in range(num_blocks))
+        self.residual_blocks = nn.ModuleList(
+            _DarknetBlock(inside, width) for _ in range(num_blocks)
+        )
 
     def forward(self, image: Tensor) -> Tensor:
         hidden = self.conv(image)
@@ -221,7 +223,7 @@ class _Level(nn.Module):
         return hidden
 
 
-class _Residual(nn.Module):
+class _DarknetBlock(nn.Module):
     def __init__(self, inside: int, width: int) -> None:
         super().__init__()
         self.residual = nn.Sequential(

@@ -17,10 +17,10 @@ from torch import Tensor, nn
 from r3dpa.features.dinov2 import TransformerTrunk, trunk_depth, usual_heads
 from r3dpa.features.official import (
     FrozenNetwork,
+    key_renamer,
     load_strictly,
     naming,
     read_state_dict,
-    renamed,
 )
 from r3dpa.geometry import EMPTY_RANGE_M, LidarSensor, SphericalProjection, unproject
 
@@ -212,7 +212,7 @@ def load_official(network: RangeViT, weights: Mapping[str, Tensor]) -> None:
     """
     constants = {"image_mean": network.image_mean, "image_std": network.image_std}
     features = {name: value for name, value in weights.items() if not name.startswith(_CLASSIFIER)}
-    load_strictly(network, constants | features, renamed(_NAMES))
+    load_strictly(network, constants | features, key_renamer(_NAMES))
 
 
 def _shape(weights: Mapping[str, Tensor], name: str) -> torch.Size:
