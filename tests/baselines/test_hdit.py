@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 
 from r3dpa.baselines.hdit import HDiT
-from r3dpa.baselines.readers import from_r2flow, hdit_weights, time_reversed
+from r3dpa.baselines.readers import from_r2flow, hdit_weights, reverse_time
 
 SIZES = {
     "resolution": (16, 128),
@@ -80,7 +80,7 @@ def test_position_network_of_fourier_features():
 def test_a_released_position_network_is_read(encoding, tmp_path):
     """Frequencies and phases, which are constants, are left out."""
     network = hdit_with(encoding)
-    official = time_reversed(network.state_dict())
+    official = reverse_time(network.state_dict())
     if encoding == "fourier_features":
         official["spatial_pe.0.embedding.freqs"] = torch.ones(9, 2, 1, 1)
         official["spatial_pe.0.embedding.phase"] = torch.zeros(9)
