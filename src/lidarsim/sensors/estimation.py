@@ -1,0 +1,525 @@
+"""Estimate of a spinning LiDAR from its scans.
+
+Letters: P points, H beams.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarsim.clouds import PointCloud, find_files, read_cloud, suffix_of
+from lidarsim.ground import ground_of
+from lidarsim.rings import Rings, rings_of
+from lidarsim.scan_files import ScanError
+from lidarsim.sensors.beams import BeamFit, ColumnFit, fit_beams, fit_columns
+from lidarsim.sensors.files import SensorFile, write_sensor
+from lidarsim.sensors.spinning import Lasers, SpinningLidar
+from lidarsim.weather import recorded_scan
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+_LEAST_DISTANCE_M = 0.1  # of points of a beam, in the plane: nearer ones have no azimuth
+_FEWEST_BEAMS = 4
+_SURE_SHARE = 0.9  # of the points on peaks of the inclination, below which beams are searched
+_NEAR_LINE_SHARE, _NEAR_LINE_DEG = 0.15, 0.02  # of the pitch, and of the angle, around a beam
+# Of the pitch, where beams are known: compensation of motion smears points over less than that.
+_KNOWN_BEAM_SHARE = 0.5
+_FEWEST_NEAR_SHARE = 0.6
+_SMEAR_DEG = 0.02
+_MIXED_SHARE = 0.3  # of the pitch between the beams of one scan and those of all
+_COHERENT = 0.5
+_DOUBLE_SHARE = 0.05
+_SECTOR_DEG, _WHOLE_TURN_DEG = 2, 350
+_FEW_POINTS = 0.02  # of the median of all degrees of azimuth: a blind sector has fewer
+_GROUND_M, _FEWEST_GROUND_POINTS = 25.0, 200
+_VEHICLE_HEIGHT_M = 0.5  # centres above the origin by more are those of a vehicle's frame
+_QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
+_WORKS_STILL = "`r3dpa data weather`, `r3dpa data view` and metrics on points still take such scans"
+
+
+class Mount(NamedTuple):
+    """Ground around the sensor."""
+
+    height_m: float  # of the origin above the ground
+    pitch_deg: float  # slope of the ground ahead
+    roll_deg: float  # slope of the ground to the left
+    spread_m: float  # standard deviation of the height over scans
+
+
+@dataclass(frozen=True, eq=False)
+class SensorEstimate:
+    """A sensor as scans show it.
+
+    Args:
+        sensor: Its beams, columns, range limits and height; other fields are those of the HDL-64E.
+        num_scans: Number of scans that were combined.
+        beams_by: ``stored``, ``order`` or ``inclination``, see :func:`lidarsim.rings.rings_of`.
+        confidence: Share from 0 to 1 by quantity.
+        residual_deg: ``(H, 5)`` quantiles 5, 25, 50, 75 and 95 % of the angle of the points of each
+            beam to its line, degrees.
+        direction: ``clockwise`` or ``counter-clockwise`` seen from above; None if unknown.
+        blind_sectors_deg: From and to of azimuths without points.
+        dropped_share: Missing shots on surfaces, as a share of all.
+        full_intensity: Full scale of the intensities; None without intensities.
+        mount: None if too little ground is seen.
+        notes: What to know about the scans.
+    """
+
+    sensor: SpinningLidar
+    num_scans: int
+    beams_by: str
+    confidence: Mapping[str, float]
+    residual_deg: Floats
+    direction: str | None
+    blind_sectors_deg: tuple[tuple[int, int], ...]
+    dropped_share: float
+    full_intensity: float | None
+    mount: Mount | None
+    notes: tuple[str, ...]
+
+    def save(self, path: str | Path, name: str = "") -> None:
+        """Write a YAML file that ``load_sensor`` reads."""
+        source = f"estimated from {self.num_scans} scans"
+        write_sensor(path, SensorFile(name or Path(path).stem, source, self.sensor), self.to_dict())
+
+    def to_dict(self) -> dict[str, Any]:
+        """What the fields of the sensor do not hold, for files."""
+        return {
+            "scans": self.num_scans,
+            "beams_by": self.beams_by,
+            "confidence": {name: round(value, 4) for name, value in self.confidence.items()},
+            "rotation": self.direction or "unknown",
+            "blind_sectors_deg": [list(sector) for sector in self.blind_sectors_deg],
+            "dropped_share": round(self.dropped_share, 5),
+            "full_intensity": self.full_intensity,
+            "mount": None if self.mount is None else self.mount._asdict(),
+            "notes": list(self.notes),
+        }
+
+    def rows(self) -> list[list[str]]:
+        """Quantity, value and confidence, for a table."""
+        lasers, sensor = self.sensor.lasers, self.sensor
+        degrees = np.degrees(lasers.inclination_rad)
+        off_deg = np.degrees(np.ptp(lasers.azimuth_offset_rad))
+        sectors = ", ".join(f"{start} to {end}" for start, end in self.blind_sectors_deg)
+        low_m, high_m = min(lasers.height_m), max(lasers.height_m)
+        values = {
+            "beams": f"{len(degrees)} by {self.beams_by}",
+            "inclination": f"{degrees[0]:.3f} to {degrees[-1]:.3f} degrees",
+            "optical centres": f"{low_m:.3f} to {high_m:.3f} m above the origin",
+            "azimuth offsets": f"within {off_deg:.3f} degrees",
+            "columns": f"{sensor.shots}",
+            "range": f"{sensor.min_range_m:.2f} to {sensor.max_range_m:.1f} m",
+            "rotation": self.direction or "unknown",
+            "blind sectors": f"{sectors} degrees" if sectors else "none",
+            "dropped shots": f"{self.dropped_share:.2%} of those on surfaces",
+        }
+        if self.full_intensity is not None:
+            values["intensity"] = f"full scale {self.full_intensity:g}"
+        if self.mount is not None:
+            values["mount"] = (
+                f"{self.mount.height_m:.2f} m above the ground, which rises by "
+                f"{self.mount.pitch_deg:.1f} degrees ahead, {self.mount.roll_deg:.1f} to the left"
+            )
+        known = self.confidence
+        return [[k, v, f"{known[k]:.0%}" if k in known else ""] for k, v in values.items()]
+
+
+class _Scan(NamedTuple):
+    name: str
+    cloud: PointCloud
+    column: Indices | None  # (P,) of an organised array
+    num_columns: int | None
+
+
+class _Points(NamedTuple):
+    """Points of all scans, with their beams in any order."""
+
+    xyz: Floats
+    beam: Indices
+    scan: Indices
+    column: Indices | None
+    how: str
+
+
+def estimate_sensor(scans: Sequence[Any] | str | Path) -> SensorEstimate:
+    """Estimate the sensor that recorded scans, all of one sensor.
+
+    Beams are those of a ring column or of an organised array; otherwise those of the order of the
+    file, or of the peaks of the inclination. Each beam is then a line in the plane of distance and
+    height, so that its optical centre is known too. Azimuth offsets are those within one column,
+    unless the array is organised, where they are those from the direction of the column.
+
+    Args:
+        scans: A scan, a folder of scans, or a sequence of files, :class:`PointCloud` or arrays:
+            ``(P, 3)``, ``(P, 4)`` with intensity, or organised ``(H, W, 3)``, 0 without return.
+
+    Raises:
+        ValueError: If the scans are of different sensors, or not of a spinning LiDAR.
+    """
+    if isinstance(scans, (str, Path)):
+        scans = find_files(Path(scans))[1]
+    if not len(scans):
+        raise ValueError("no scans given")
+    read = [_read(scan, number) for number, scan in enumerate(scans)]
+    points, notes = _combine(read)
+    names = [scan.name for scan in read]
+
+    distance_m = np.hypot(points.xyz[:, 0], points.xyz[:, 1])
+    beams = fit_beams(points.beam, distance_m, points.xyz[:, 2])
+    points, beams = _highest_first(points, beams)
+    near_share = _check_spinning(points, beams)
+    notes += _disagreement(points, beams, names)
+    smear_deg = float(np.degrees(np.median(np.abs(beams.residual))))
+    if smear_deg > _SMEAR_DEG:
+        notes.append(
+            f"points lie {smear_deg:.3f} degrees (median) off their beams, as in scans compensated "
+            "for motion: raw scans give better angles"
+        )
+    if not beams.is_sure_height.all():
+        num = np.count_nonzero(~beams.is_sure_height)
+        notes.append(f"{num} beams see one distance: their optical centres are interpolated")
+
+    azimuth = np.arctan2(points.xyz[:, 1], points.xyz[:, 0])
+    columns = fit_columns(points.beam, azimuth, distance_m, points.scan)
+    if columns.coherence < _COHERENT:
+        notes.append("azimuths lie on no common steps: the columns are those of the mean step")
+    direction, head = _rotation(read, points, azimuth)
+    num_columns, offset, sure_columns = columns.columns, columns.offset, columns.coherence
+    if points.column is not None and head is not None:
+        num_columns, sure_columns = int(read[0].num_columns or 0), 1.0
+        offset = _offsets(points, azimuth - columns.lateral_m[points.beam] / distance_m - head)
+
+    sectors, covered_deg = _blind_sectors(azimuth)
+    if covered_deg < _WHOLE_TURN_DEG:
+        notes.append(f"the scans cover {covered_deg} of 360 degrees; columns are of a whole turn")
+    if is_dual := columns.double_share > _DOUBLE_SHARE:
+        notes.append(f"{columns.double_share:.0%} of the points are second returns of a shot")
+    height_m, mount, mount_notes = _mount(read, beams)
+    range_m = np.sqrt(np.square(points.xyz).sum(axis=1))
+    settings: dict[str, Any] = {} if mount is None else {"mount_height_m": mount.height_m}
+    sensor = SpinningLidar(
+        _lasers(beams, columns, offset, height_m),
+        num_columns,
+        min_range_m=math.floor(100 * range_m.min()) / 100,
+        max_range_m=math.ceil(10 * range_m.max()) / 10,
+        return_mode="dual" if is_dual else "strongest",
+        **settings,
+    )
+    confidence = {
+        "beams": near_share,
+        "inclination": near_share,
+        "optical centres": float(beams.is_sure_height.mean()),
+        "azimuth offsets": sure_columns,
+        "columns": sure_columns,
+    }
+    if mount is not None:
+        confidence["mount"] = float(np.exp(-mount.spread_m / 0.1))
+    return SensorEstimate(
+        sensor,
+        len(read),
+        points.how,
+        confidence,
+        _residual_quantiles(points.beam, beams.residual),
+        direction,
+        sectors,
+        columns.dropped_share,
+        None if read[0].cloud.intensity is None else _full_intensity(read),
+        mount,
+        tuple(notes + mount_notes),
+    )
+
+
+def _read(scan: Any, number: int) -> _Scan:
+    name, column, shape = f"scan {number}", None, None
+    if isinstance(scan, PointCloud):
+        cloud = scan
+        name = cloud.where if cloud.file is not None else name
+    elif isinstance(scan, (str, Path)):
+        name, cloud = str(scan), read_cloud(scan, drop_nan=True, with_labels=False)
+        organised = _organised_file(Path(scan))
+        if organised is not None:
+            shape, column = organised.shape, _returns(organised)[1]
+    else:
+        array = np.asarray(scan)
+        if array.ndim == 3:
+            row, column = _returns(array)
+            shape = array.shape
+            cloud = PointCloud.of(array[row, column, :3], ring=row)
+        else:
+            cloud = PointCloud.of(array)
+    is_zero = ~cloud.points.any(axis=1)
+    if is_zero.all():
+        raise ScanError(f"{name}: all of its {len(cloud)} points are 0; export it again")
+    cloud.check_metres()
+    usable = column is not None and shape is not None and len(column) == len(cloud)
+    return _Scan(name, cloud, column if usable else None, shape[1] if shape and usable else None)
+
+
+def _organised_file(path: Path) -> NDArray | None:
+    """Array ``(H, W, C)`` of a NumPy file; None if its points are in rows."""
+    if suffix_of(path) not in (".npy", ".npz"):
+        return None
+    content = np.load(path)
+    if not isinstance(content, np.ndarray):
+        names = [name for name in ("xyz", "points") if name in content.files]
+        content = content[names[0]] if names else np.zeros(0)
+    return content if content.ndim == 3 else None
+
+
+def _returns(array: NDArray) -> tuple[Indices, Indices]:
+    """Row and column of the returns of an organised array."""
+    xyz = array[..., :3]
+    return np.nonzero(np.isfinite(xyz).all(axis=2) & xyz.any(axis=2))
+
+
+def _combine(read: Sequence[_Scan]) -> tuple[_Points, list[str]]:
+    """Points of all scans that show the same beams, and notes about the others."""
+    notes: list[str] = []
+    rings = _with_searched_beams(read, [rings_of(recorded_scan(scan.cloud)) for scan in read])
+    counts = Counter(ring.num_rings for ring in rings)
+    usual = counts.most_common(1)[0][0]
+    is_stored = all(ring.how == "stored" for ring in rings)
+    odd = [i for i, ring in enumerate(rings) if ring.num_rings != usual]
+    if odd and (2 * len(odd) > len(read) or any(_is_other(rings[i].num_rings, usual) for i in odd)):
+        same = next(i for i, ring in enumerate(rings) if ring.num_rings == usual)
+        raise ValueError(
+            f"{read[same].name} shows {usual} beams, {read[odd[0]].name} "
+            f"{rings[odd[0]].num_rings}: give scans of one sensor"
+        )
+    if odd and not is_stored:
+        notes.append(f"{len(odd)} of {len(read)} scans show other than {usual} beams: left out")
+    unsure = next((i for i, ring in enumerate(rings) if ring.sure == 0), None)
+    if usual < _FEWEST_BEAMS or unsure is not None:
+        name = read[unsure or 0].name
+        raise ValueError(
+            f"{name}: no beams found, as in scans of solid-state or non-repetitive LiDARs, which "
+            f"have none; {_WORKS_STILL}"
+        )
+    used = [i for i in range(len(read)) if is_stored or i not in odd]
+    parts, columns = [], []
+    for number in used:
+        scan, ring = read[number], rings[number]
+        beam = np.asarray(scan.cloud.ring).astype(np.int64) if is_stored else ring.ring
+        xyz = scan.cloud.points.astype(float)
+        keep = np.hypot(xyz[:, 0], xyz[:, 1]) > _LEAST_DISTANCE_M
+        parts.append((xyz[keep], beam[keep], np.full(np.count_nonzero(keep), number)))
+        columns.append(None if scan.column is None else scan.column[keep])
+    xyz, beam, place = (np.concatenate(column) for column in zip(*parts, strict=True))
+    organised = [column for column in columns if column is not None]
+    column = np.concatenate(organised) if len(organised) == len(columns) else None
+    beam = np.unique(beam, return_inverse=True)[1]
+    how = "a stored ring" if is_stored else "the " + rings[used[0]].how
+    return _Points(xyz, beam, place, column, how), notes
+
+
+def _with_searched_beams(read: Sequence[_Scan], rings: list[Rings]) -> list[Rings]:
+    """Rings whose unsure ones are found by alice-lri, if it is installed.
+
+    It needs a minute or more for a scan, so that its lines of the first scan serve all.
+    """
+    if not any(ring.how == "inclination" and ring.sure < _SURE_SHARE for ring in rings):
+        return rings
+    try:
+        from alice_lri import estimate_intrinsics
+    except ImportError:
+        return rings
+    xyz = read[0].cloud.points.astype(float)
+    xyz = xyz[np.hypot(xyz[:, 0], xyz[:, 1]) > _LEAST_DISTANCE_M]
+    lines = estimate_intrinsics(*(np.ascontiguousarray(axis) for axis in xyz.T)).scanlines
+    searched = []
+    for scan, ring in zip(read, rings, strict=True):
+        x, y, z = scan.cloud.points.astype(float).T
+        distance_m = np.maximum(np.hypot(x, y), _LEAST_DISTANCE_M)
+        nearest, least = np.zeros(len(z), np.int64), np.full(len(z), np.inf)
+        for number, line in enumerate(lines):
+            off = np.abs(np.arctan2(z - line.vertical_offset, distance_m) - line.vertical_angle)
+            nearest[off < least] = number
+            least = np.minimum(least, off)
+        searched.append(ring._replace(ring=nearest, num_rings=len(lines), sure=1.0))
+    return searched
+
+
+def _is_other(num_beams: int, usual: int) -> bool:
+    """Whether a number of beams is that of another sensor, rather than of a beam without points."""
+    return not 0.8 * usual <= num_beams <= 1.25 * usual
+
+
+def _highest_first(points: _Points, beams: BeamFit) -> tuple[_Points, BeamFit]:
+    order = np.argsort(-beams.inclination, kind="stable")
+    inclination, height_m, is_sure = (column[order] for column in beams[:3])
+    points = points._replace(beam=np.argsort(order)[points.beam])
+    return points, BeamFit(inclination, height_m, is_sure, beams.residual)
+
+
+def _pitch(inclination: Floats) -> Floats:
+    """Distance ``(H,)`` of each beam to its nearest neighbour."""
+    gap = -np.diff(inclination)
+    return np.minimum(np.append(gap, np.inf), np.append(np.inf, gap))
+
+
+def _check_spinning(points: _Points, beams: BeamFit) -> float:
+    """Share of the points near the line of their beam; ValueError if there are no such lines."""
+    pitch, off = float(np.median(_pitch(beams.inclination))), np.abs(beams.residual)
+    near = max(_NEAR_LINE_SHARE * pitch, math.radians(_NEAR_LINE_DEG))
+    share = float((off < near).mean())
+    is_guess = points.how.endswith("inclination")
+    loose_share = share if is_guess else float((off < _KNOWN_BEAM_SHARE * pitch).mean())
+    if loose_share < _FEWEST_NEAR_SHARE:
+        raise ValueError(
+            f"only {loose_share:.0%} of the points lie on {len(beams.inclination)} beams found by "
+            f"{points.how}: the scans are of a solid-state or non-repetitive LiDAR, or shuffled; "
+            f"give scans in their original order or with a ring column, or install "
+            f"'r3dpa[sensor]', which looks for beams longer. {_WORKS_STILL}"
+        )
+    return share
+
+
+def _disagreement(points: _Points, beams: BeamFit, names: Sequence[str]) -> list[str]:
+    """Note about the scan whose beams are farthest from those of all scans."""
+    numbers = np.unique(points.scan)
+    if len(numbers) < 2:
+        return []
+    num_beams, largest = len(beams.inclination), (0.0, 0.0, 0)
+    for number in numbers:
+        rows = np.flatnonzero(points.scan == number)
+        order = rows[np.argsort(points.beam[rows], kind="stable")]
+        groups = np.split(beams.residual[order], np.cumsum(_counts(points.beam[rows], num_beams)))
+        median = np.array([np.median(group) if len(group) else 0.0 for group in groups[:num_beams]])
+        typical = float(np.median(np.abs(median)))
+        largest = max(largest, (typical, float(np.abs(median).max()), int(number)))
+    typical, most, number = largest
+    if typical > _MIXED_SHARE * np.median(_pitch(beams.inclination)):
+        raise ValueError(
+            f"{names[number]}: its beams lie {np.degrees(typical):.2f} degrees from those of the "
+            "other scans: give scans of one sensor"
+        )
+    return [
+        f"beams of single scans lie within {np.degrees(most):.4f} degrees of those of all "
+        f"{len(numbers)} (largest in {names[number]})"
+    ]
+
+
+def _counts(beam: Indices, num_beams: int) -> Indices:
+    return np.bincount(beam, minlength=num_beams)
+
+
+def _rotation(
+    read: Sequence[_Scan], points: _Points, azimuth: Floats
+) -> tuple[str | None, Floats | None]:
+    """Direction of rotation, and azimuth of the head at each point of organised arrays."""
+    head = None
+    if points.column is not None:
+        order = np.lexsort((points.column, points.beam, points.scan))
+        sign = _sign(azimuth[order], points.beam[order])
+        head = sign * 2 * math.pi * points.column / int(read[0].num_columns or 1)
+    elif read[0].cloud.time_s is not None and np.ptp(read[0].cloud.time_s) > 0:
+        xyz = read[0].cloud.points.astype(float)
+        order = np.argsort(read[0].cloud.time_s, kind="stable")
+        beams = np.zeros(len(order)) if read[0].cloud.ring is None else read[0].cloud.ring[order]
+        by_beam = np.argsort(beams, kind="stable")
+        turned = np.arctan2(xyz[:, 1], xyz[:, 0])[order][by_beam]
+        sign = _sign(turned, beams[by_beam])
+    elif read[0].cloud.ring is not None and (np.diff(read[0].cloud.ring) != 0).mean() > 0.5:
+        # Firing after firing, in the order of time.
+        first = np.flatnonzero(points.scan == points.scan[0])
+        order = first[np.argsort(points.beam[first], kind="stable")]
+        sign = _sign(azimuth[order], points.beam[order])
+    else:
+        return None, None
+    return ("counter-clockwise" if sign > 0 else "clockwise"), head
+
+
+def _sign(azimuth: Floats, beam: NDArray) -> float:
+    """Sign of the usual step of azimuth within beams."""
+    step = (np.diff(azimuth) + math.pi) % (2 * math.pi) - math.pi
+    return float(np.sign(np.median(step[np.diff(beam) == 0])))
+
+
+def _offsets(points: _Points, turned: Floats) -> Floats:
+    """Azimuth offset ``(H,)`` from the head, whose zero is such that their mean is zero."""
+    num_beams = int(points.beam.max()) + 1
+    real = np.bincount(points.beam, np.cos(turned), num_beams)
+    imaginary = np.bincount(points.beam, np.sin(turned), num_beams)
+    offset = np.arctan2(imaginary, real)
+    middle = math.atan2(np.sin(offset).mean(), np.cos(offset).mean())
+    return (offset - middle + math.pi) % (2 * math.pi) - math.pi
+
+
+def _blind_sectors(azimuth: Floats) -> tuple[tuple[tuple[int, int], ...], int]:
+    """Sectors without points from and to whole degrees, and degrees that hold points."""
+    counts = np.bincount(
+        np.floor(np.degrees(azimuth % (2 * math.pi))).astype(int) % 360, minlength=360
+    )
+    is_blind = counts < _FEW_POINTS * np.median(counts[counts > 0])
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], is_blind.astype(int), [0]])))
+    sectors = [(int(a), int(b)) for a, b in edges.reshape(-1, 2) if b - a >= _SECTOR_DEG]
+    return tuple(sectors), int(360 - sum(b - a for a, b in sectors))
+
+
+def _mount(read: Sequence[_Scan], beams: BeamFit) -> tuple[Floats, Mount | None, list[str]]:
+    """Height of the optical centres, ground, and notes about the frame."""
+    notes, height_m = [], beams.height_m
+    shift_m = float(np.median(height_m))
+    is_shifted = abs(shift_m) > _VEHICLE_HEIGHT_M
+    planes = [plane for scan in read if (plane := _ground_plane(scan)) is not None]
+    if is_shifted:
+        notes.append(
+            f"the beams start {shift_m:.2f} m above the origin, as in the frame of a vehicle: "
+            "subtract that, as all commands take the sensor as the origin"
+        )
+        height_m = height_m - shift_m
+    if not planes:
+        return height_m, None, [*notes, "little ground is seen: the mount is that of the HDL-64E"]
+    slopes = np.median(planes, axis=0)
+    heights = np.array([plane[2] for plane in planes])
+    above_m = (shift_m if is_shifted else 0.0) - float(np.median(heights))
+    if above_m <= 0:
+        raise ValueError(
+            f"{read[0].name}: the ground lies {-above_m:.2f} m above the sensor: turn the points so "
+            "that z points up, x forward and y left"
+        )
+    pitch_deg, roll_deg = (float(np.degrees(np.arctan(slope))) for slope in slopes[:2])
+    return height_m, Mount(above_m, pitch_deg, roll_deg, float(heights.std())), notes
+
+
+def _ground_plane(scan: _Scan) -> Floats | None:
+    """Slopes along x and y, and height at the origin, of the ground; None if little is seen."""
+    points = scan.cloud.points
+    near = points[np.hypot(points[:, 0], points[:, 1]) < _GROUND_M].astype(np.float32)
+    if len(near) < _FEWEST_GROUND_POINTS:
+        return None
+    ground = near[ground_of(near)[0]].astype(float)
+    if len(ground) < _FEWEST_GROUND_POINTS:
+        return None
+    design = np.column_stack([ground[:, :2], np.ones(len(ground))])
+    return np.linalg.lstsq(design, ground[:, 2], rcond=None)[0]
+
+
+def _lasers(beams: BeamFit, columns: ColumnFit, offset: Floats, height_m: Floats) -> Lasers:
+    inclination, least = beams.inclination.copy(), math.radians(1e-6)
+    for number in range(1, len(inclination)):  # beams side by side, at the same inclination
+        inclination[number] = min(inclination[number], inclination[number - 1] - least)
+    zeros = np.zeros(len(offset))
+    table = (inclination, offset, height_m, columns.lateral_m, zeros, zeros + 1)
+    return Lasers(*(tuple(map(float, column)) for column in table))
+
+
+def _residual_quantiles(beam: Indices, residual: Floats) -> Floats:
+    order = np.argsort(beam, kind="stable")
+    groups = np.split(residual[order], np.cumsum(np.bincount(beam))[:-1])
+    return np.degrees([np.quantile(group, _QUANTILES) for group in groups])
+
+
+def _full_intensity(read: Sequence[_Scan]) -> float:
+    largest = max(float(np.max(scan.cloud.intensity)) for scan in read)
+    return next((full for full in (1.0, 255.0, 65535.0) if largest <= full), largest)
