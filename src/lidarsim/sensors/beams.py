@@ -10,6 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+from scipy.signal import find_peaks
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -23,6 +25,9 @@ _MOST_LATERAL_M = 0.1
 _UNBROKEN = 1.35  # times the median step of azimuth
 _SAME_SURFACE = 0.05  # relative difference of distance of neighbours on a surface
 _COLUMN_SEARCH = 0.03  # share of the first guess of the columns searched to both sides
+# Search of beams: points this near to a line are on it, bins of further lines, least peak of them.
+_SEARCHES, _NEAR_DEG, _BIN_DEG, _PEAK, _FEWEST_REST_SHARE = 12, 0.03, 0.01, 0.2, 1e-3
+_MOST_BEAMS = 140  # of lines: 128 beams, and some that are merged later
 _COHERENT = 0.5  # less, and azimuths lie on no common steps
 _SOME_BEAMS = 16
 _MOST_DROPPED = 3  # longer gaps are no dropped shots
@@ -152,8 +157,8 @@ def fit_columns(beam: Indices, azimuth: Floats, distance_m: Floats, scan: Indice
         lateral_m,
         offset,
         residual,
-        num_dropped / (num_dropped + num_level),
-        doubles / len(azimuth),
+        num_dropped / (num_dropped + int(num_level)),
+        int(doubles) / len(azimuth),
     )
 
 
@@ -199,3 +204,47 @@ def _most_coherent(group: Indices, azimuth: Floats, guess: float) -> tuple[int, 
     if coherence[best] < _COHERENT:
         return round(guess), coherence[best]
     return candidates[best], coherence[best]
+
+
+def search_beams(beam: Indices, distance_m: Floats, z_m: Floats) -> Indices | None:
+    """Improve a guess of the beam ``(P,)`` of each point of an unordered scan.
+
+    Lines are fitted to the guess and points given to the nearest line. Lines side by side are
+    merged, and peaks of the inclination of the points on no line become further ones. None if
+    points on no line are left in the end, as where optical centres lie far from each other.
+    """
+    near, bin_rad = math.radians(_NEAR_DEG), math.radians(_BIN_DEG)
+    for _ in range(_SEARCHES):
+        fit = fit_beams(beam, distance_m, z_m)
+        order = np.argsort(-fit.inclination)
+        is_new = np.append(True, np.diff(fit.inclination[order]) < -near)
+        inclination, height_m = fit.inclination[order][is_new], fit.height_m[order][is_new]
+        beam, off = nearest_line(inclination, height_m, distance_m, z_m)
+        rest = np.flatnonzero(off > near)
+        if len(rest) < _FEWEST_REST_SHARE * len(z_m):
+            return np.unique(beam, return_inverse=True)[1]
+        if len(inclination) > _MOST_BEAMS:
+            break
+        seen = np.arctan2(z_m[rest] - np.median(height_m), distance_m[rest])
+        place = np.floor((seen - seen.min()) / bin_rad).astype(np.int64) + 5
+        density = gaussian_filter1d(np.bincount(place, minlength=place.max() + 5) + 0.0, 1.0)
+        peaks, _ = find_peaks(density, prominence=_PEAK * density.max())
+        middle = seen.min() + (peaks - 4.5) * bin_rad
+        if len(middle):
+            nearest = np.abs(seen[:, None] - middle).argmin(axis=1)
+            is_close = np.abs(seen - middle[nearest]) < near
+            beam[rest[is_close]] = len(inclination) + nearest[is_close]
+        beam = np.unique(beam, return_inverse=True)[1]
+    return None
+
+
+def nearest_line(
+    inclination: Floats, height_m: Floats, distance_m: Floats, z_m: Floats
+) -> tuple[Indices, Floats]:
+    """Line ``(P,)`` whose angle is nearest to that of each point, and the difference."""
+    nearest, least = np.zeros(len(z_m), np.int64), np.full(len(z_m), np.inf)
+    for number in range(len(inclination)):
+        off = np.abs(np.arctan2(z_m - height_m[number], distance_m) - inclination[number])
+        nearest[off < least] = number
+        least = np.minimum(least, off)
+    return nearest, least

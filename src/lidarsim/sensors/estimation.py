@@ -6,7 +6,6 @@ Letters: P points, H beams.
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,21 +14,22 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarsim.clouds import PointCloud, find_files, read_cloud, suffix_of
+from lidarsim.clouds import find_files
 from lidarsim.ground import ground_of
-from lidarsim.rings import Rings, rings_of
-from lidarsim.scan_files import ScanError
 from lidarsim.sensors.beams import BeamFit, ColumnFit, fit_beams, fit_columns
 from lidarsim.sensors.files import SensorFile, write_sensor
+from lidarsim.sensors.recordings import (
+    WORKS_STILL,
+    BeamPoints,
+    SensorScan,
+    combine,
+    read_scan_of,
+)
 from lidarsim.sensors.spinning import Lasers, SpinningLidar
-from lidarsim.weather import recorded_scan
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-_LEAST_DISTANCE_M = 0.1  # of points of a beam, in the plane: nearer ones have no azimuth
-_FEWEST_BEAMS = 4
-_SURE_SHARE = 0.9  # of the points on peaks of the inclination, below which beams are searched
 _NEAR_LINE_SHARE, _NEAR_LINE_DEG = 0.15, 0.02  # of the pitch, and of the angle, around a beam
 # Of the pitch, where beams are known: compensation of motion smears points over less than that.
 _KNOWN_BEAM_SHARE = 0.5
@@ -43,7 +43,6 @@ _FEW_POINTS = 0.02  # of the median of all degrees of azimuth: a blind sector ha
 _GROUND_M, _FEWEST_GROUND_POINTS = 25.0, 200
 _VEHICLE_HEIGHT_M = 0.5  # centres above the origin by more are those of a vehicle's frame
 _QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
-_WORKS_STILL = "`r3dpa data weather`, `r3dpa data view` and metrics on points still take such scans"
 
 
 class Mount(NamedTuple):
@@ -93,6 +92,9 @@ class SensorEstimate:
 
     def to_dict(self) -> dict[str, Any]:
         """What the fields of the sensor do not hold, for files."""
+        mount = None
+        if self.mount is not None:
+            mount = {name: round(value, 4) for name, value in self.mount._asdict().items()}
         return {
             "scans": self.num_scans,
             "beams_by": self.beams_by,
@@ -101,7 +103,7 @@ class SensorEstimate:
             "blind_sectors_deg": [list(sector) for sector in self.blind_sectors_deg],
             "dropped_share": round(self.dropped_share, 5),
             "full_intensity": self.full_intensity,
-            "mount": None if self.mount is None else self.mount._asdict(),
+            "mount": mount,
             "notes": list(self.notes),
         }
 
@@ -134,23 +136,6 @@ class SensorEstimate:
         return [[k, v, f"{known[k]:.0%}" if k in known else ""] for k, v in values.items()]
 
 
-class _Scan(NamedTuple):
-    name: str
-    cloud: PointCloud
-    column: Indices | None  # (P,) of an organised array
-    num_columns: int | None
-
-
-class _Points(NamedTuple):
-    """Points of all scans, with their beams in any order."""
-
-    xyz: Floats
-    beam: Indices
-    scan: Indices
-    column: Indices | None
-    how: str
-
-
 def estimate_sensor(scans: Sequence[Any] | str | Path) -> SensorEstimate:
     """Estimate the sensor that recorded scans, all of one sensor.
 
@@ -170,8 +155,8 @@ def estimate_sensor(scans: Sequence[Any] | str | Path) -> SensorEstimate:
         scans = find_files(Path(scans))[1]
     if not len(scans):
         raise ValueError("no scans given")
-    read = [_read(scan, number) for number, scan in enumerate(scans)]
-    points, notes = _combine(read)
+    read = [read_scan_of(scan, number) for number, scan in enumerate(scans)]
+    points, notes = combine(read)
     names = [scan.name for scan in read]
 
     distance_m = np.hypot(points.xyz[:, 0], points.xyz[:, 1])
@@ -183,7 +168,7 @@ def estimate_sensor(scans: Sequence[Any] | str | Path) -> SensorEstimate:
     if smear_deg > _SMEAR_DEG:
         notes.append(
             f"points lie {smear_deg:.3f} degrees (median) off their beams, as in scans compensated "
-            "for motion: raw scans give better angles"
+            "for motion: raw scans give better angles and centres"
         )
     if not beams.is_sure_height.all():
         num = np.count_nonzero(~beams.is_sure_height)
@@ -206,7 +191,7 @@ def estimate_sensor(scans: Sequence[Any] | str | Path) -> SensorEstimate:
         notes.append(f"{columns.double_share:.0%} of the points are second returns of a shot")
     height_m, mount, mount_notes = _mount(read, beams)
     range_m = np.sqrt(np.square(points.xyz).sum(axis=1))
-    settings: dict[str, Any] = {} if mount is None else {"mount_height_m": mount.height_m}
+    settings: dict[str, Any] = {} if mount is None else {"mount_height_m": round(mount.height_m, 4)}
     sensor = SpinningLidar(
         _lasers(beams, columns, offset, height_m),
         num_columns,
@@ -218,7 +203,7 @@ def estimate_sensor(scans: Sequence[Any] | str | Path) -> SensorEstimate:
     confidence = {
         "beams": near_share,
         "inclination": near_share,
-        "optical centres": float(beams.is_sure_height.mean()),
+        "optical centres": near_share * float(beams.is_sure_height.mean()),
         "azimuth offsets": sure_columns,
         "columns": sure_columns,
     }
@@ -239,122 +224,7 @@ def estimate_sensor(scans: Sequence[Any] | str | Path) -> SensorEstimate:
     )
 
 
-def _read(scan: Any, number: int) -> _Scan:
-    name, column, shape = f"scan {number}", None, None
-    if isinstance(scan, PointCloud):
-        cloud = scan
-        name = cloud.where if cloud.file is not None else name
-    elif isinstance(scan, (str, Path)):
-        name, cloud = str(scan), read_cloud(scan, drop_nan=True, with_labels=False)
-        organised = _organised_file(Path(scan))
-        if organised is not None:
-            shape, column = organised.shape, _returns(organised)[1]
-    else:
-        array = np.asarray(scan)
-        if array.ndim == 3:
-            row, column = _returns(array)
-            shape = array.shape
-            cloud = PointCloud.of(array[row, column, :3], ring=row)
-        else:
-            cloud = PointCloud.of(array)
-    is_zero = ~cloud.points.any(axis=1)
-    if is_zero.all():
-        raise ScanError(f"{name}: all of its {len(cloud)} points are 0; export it again")
-    cloud.check_metres()
-    usable = column is not None and shape is not None and len(column) == len(cloud)
-    return _Scan(name, cloud, column if usable else None, shape[1] if shape and usable else None)
-
-
-def _organised_file(path: Path) -> NDArray | None:
-    """Array ``(H, W, C)`` of a NumPy file; None if its points are in rows."""
-    if suffix_of(path) not in (".npy", ".npz"):
-        return None
-    content = np.load(path)
-    if not isinstance(content, np.ndarray):
-        names = [name for name in ("xyz", "points") if name in content.files]
-        content = content[names[0]] if names else np.zeros(0)
-    return content if content.ndim == 3 else None
-
-
-def _returns(array: NDArray) -> tuple[Indices, Indices]:
-    """Row and column of the returns of an organised array."""
-    xyz = array[..., :3]
-    return np.nonzero(np.isfinite(xyz).all(axis=2) & xyz.any(axis=2))
-
-
-def _combine(read: Sequence[_Scan]) -> tuple[_Points, list[str]]:
-    """Points of all scans that show the same beams, and notes about the others."""
-    notes: list[str] = []
-    rings = _with_searched_beams(read, [rings_of(recorded_scan(scan.cloud)) for scan in read])
-    counts = Counter(ring.num_rings for ring in rings)
-    usual = counts.most_common(1)[0][0]
-    is_stored = all(ring.how == "stored" for ring in rings)
-    odd = [i for i, ring in enumerate(rings) if ring.num_rings != usual]
-    if odd and (2 * len(odd) > len(read) or any(_is_other(rings[i].num_rings, usual) for i in odd)):
-        same = next(i for i, ring in enumerate(rings) if ring.num_rings == usual)
-        raise ValueError(
-            f"{read[same].name} shows {usual} beams, {read[odd[0]].name} "
-            f"{rings[odd[0]].num_rings}: give scans of one sensor"
-        )
-    if odd and not is_stored:
-        notes.append(f"{len(odd)} of {len(read)} scans show other than {usual} beams: left out")
-    unsure = next((i for i, ring in enumerate(rings) if ring.sure == 0), None)
-    if usual < _FEWEST_BEAMS or unsure is not None:
-        name = read[unsure or 0].name
-        raise ValueError(
-            f"{name}: no beams found, as in scans of solid-state or non-repetitive LiDARs, which "
-            f"have none; {_WORKS_STILL}"
-        )
-    used = [i for i in range(len(read)) if is_stored or i not in odd]
-    parts, columns = [], []
-    for number in used:
-        scan, ring = read[number], rings[number]
-        beam = np.asarray(scan.cloud.ring).astype(np.int64) if is_stored else ring.ring
-        xyz = scan.cloud.points.astype(float)
-        keep = np.hypot(xyz[:, 0], xyz[:, 1]) > _LEAST_DISTANCE_M
-        parts.append((xyz[keep], beam[keep], np.full(np.count_nonzero(keep), number)))
-        columns.append(None if scan.column is None else scan.column[keep])
-    xyz, beam, place = (np.concatenate(column) for column in zip(*parts, strict=True))
-    organised = [column for column in columns if column is not None]
-    column = np.concatenate(organised) if len(organised) == len(columns) else None
-    beam = np.unique(beam, return_inverse=True)[1]
-    how = "a stored ring" if is_stored else "the " + rings[used[0]].how
-    return _Points(xyz, beam, place, column, how), notes
-
-
-def _with_searched_beams(read: Sequence[_Scan], rings: list[Rings]) -> list[Rings]:
-    """Rings whose unsure ones are found by alice-lri, if it is installed.
-
-    It needs a minute or more for a scan, so that its lines of the first scan serve all.
-    """
-    if not any(ring.how == "inclination" and ring.sure < _SURE_SHARE for ring in rings):
-        return rings
-    try:
-        from alice_lri import estimate_intrinsics
-    except ImportError:
-        return rings
-    xyz = read[0].cloud.points.astype(float)
-    xyz = xyz[np.hypot(xyz[:, 0], xyz[:, 1]) > _LEAST_DISTANCE_M]
-    lines = estimate_intrinsics(*(np.ascontiguousarray(axis) for axis in xyz.T)).scanlines
-    searched = []
-    for scan, ring in zip(read, rings, strict=True):
-        x, y, z = scan.cloud.points.astype(float).T
-        distance_m = np.maximum(np.hypot(x, y), _LEAST_DISTANCE_M)
-        nearest, least = np.zeros(len(z), np.int64), np.full(len(z), np.inf)
-        for number, line in enumerate(lines):
-            off = np.abs(np.arctan2(z - line.vertical_offset, distance_m) - line.vertical_angle)
-            nearest[off < least] = number
-            least = np.minimum(least, off)
-        searched.append(ring._replace(ring=nearest, num_rings=len(lines), sure=1.0))
-    return searched
-
-
-def _is_other(num_beams: int, usual: int) -> bool:
-    """Whether a number of beams is that of another sensor, rather than of a beam without points."""
-    return not 0.8 * usual <= num_beams <= 1.25 * usual
-
-
-def _highest_first(points: _Points, beams: BeamFit) -> tuple[_Points, BeamFit]:
+def _highest_first(points: BeamPoints, beams: BeamFit) -> tuple[BeamPoints, BeamFit]:
     order = np.argsort(-beams.inclination, kind="stable")
     inclination, height_m, is_sure = (column[order] for column in beams[:3])
     points = points._replace(beam=np.argsort(order)[points.beam])
@@ -367,7 +237,7 @@ def _pitch(inclination: Floats) -> Floats:
     return np.minimum(np.append(gap, np.inf), np.append(np.inf, gap))
 
 
-def _check_spinning(points: _Points, beams: BeamFit) -> float:
+def _check_spinning(points: BeamPoints, beams: BeamFit) -> float:
     """Share of the points near the line of their beam; ValueError if there are no such lines."""
     pitch, off = float(np.median(_pitch(beams.inclination))), np.abs(beams.residual)
     near = max(_NEAR_LINE_SHARE * pitch, math.radians(_NEAR_LINE_DEG))
@@ -379,12 +249,12 @@ def _check_spinning(points: _Points, beams: BeamFit) -> float:
             f"only {loose_share:.0%} of the points lie on {len(beams.inclination)} beams found by "
             f"{points.how}: the scans are of a solid-state or non-repetitive LiDAR, or shuffled; "
             f"give scans in their original order or with a ring column, or install "
-            f"'r3dpa[sensor]', which looks for beams longer. {_WORKS_STILL}"
+            f"'r3dpa[sensor]', which looks for beams longer. {WORKS_STILL}"
         )
     return share
 
 
-def _disagreement(points: _Points, beams: BeamFit, names: Sequence[str]) -> list[str]:
+def _disagreement(points: BeamPoints, beams: BeamFit, names: Sequence[str]) -> list[str]:
     """Note about the scan whose beams are farthest from those of all scans."""
     numbers = np.unique(points.scan)
     if len(numbers) < 2:
@@ -414,7 +284,7 @@ def _counts(beam: Indices, num_beams: int) -> Indices:
 
 
 def _rotation(
-    read: Sequence[_Scan], points: _Points, azimuth: Floats
+    read: Sequence[SensorScan], points: BeamPoints, azimuth: Floats
 ) -> tuple[str | None, Floats | None]:
     """Direction of rotation, and azimuth of the head at each point of organised arrays."""
     head = None
@@ -445,7 +315,7 @@ def _sign(azimuth: Floats, beam: NDArray) -> float:
     return float(np.sign(np.median(step[np.diff(beam) == 0])))
 
 
-def _offsets(points: _Points, turned: Floats) -> Floats:
+def _offsets(points: BeamPoints, turned: Floats) -> Floats:
     """Azimuth offset ``(H,)`` from the head, whose zero is such that their mean is zero."""
     num_beams = int(points.beam.max()) + 1
     real = np.bincount(points.beam, np.cos(turned), num_beams)
@@ -466,7 +336,7 @@ def _blind_sectors(azimuth: Floats) -> tuple[tuple[tuple[int, int], ...], int]:
     return tuple(sectors), int(360 - sum(b - a for a, b in sectors))
 
 
-def _mount(read: Sequence[_Scan], beams: BeamFit) -> tuple[Floats, Mount | None, list[str]]:
+def _mount(read: Sequence[SensorScan], beams: BeamFit) -> tuple[Floats, Mount | None, list[str]]:
     """Height of the optical centres, ground, and notes about the frame."""
     notes, height_m = [], beams.height_m
     shift_m = float(np.median(height_m))
@@ -485,14 +355,14 @@ def _mount(read: Sequence[_Scan], beams: BeamFit) -> tuple[Floats, Mount | None,
     above_m = (shift_m if is_shifted else 0.0) - float(np.median(heights))
     if above_m <= 0:
         raise ValueError(
-            f"{read[0].name}: the ground lies {-above_m:.2f} m above the sensor: turn the points so "
-            "that z points up, x forward and y left"
+            f"{read[0].name}: the ground lies {-above_m:.2f} m above the sensor: turn the points "
+            "so that z points up, x forward and y left"
         )
     pitch_deg, roll_deg = (float(np.degrees(np.arctan(slope))) for slope in slopes[:2])
     return height_m, Mount(above_m, pitch_deg, roll_deg, float(heights.std())), notes
 
 
-def _ground_plane(scan: _Scan) -> Floats | None:
+def _ground_plane(scan: SensorScan) -> Floats | None:
     """Slopes along x and y, and height at the origin, of the ground; None if little is seen."""
     points = scan.cloud.points
     near = points[np.hypot(points[:, 0], points[:, 1]) < _GROUND_M].astype(np.float32)
@@ -520,6 +390,6 @@ def _residual_quantiles(beam: Indices, residual: Floats) -> Floats:
     return np.degrees([np.quantile(group, _QUANTILES) for group in groups])
 
 
-def _full_intensity(read: Sequence[_Scan]) -> float:
+def _full_intensity(read: Sequence[SensorScan]) -> float:
     largest = max(float(np.max(scan.cloud.intensity)) for scan in read)
     return next((full for full in (1.0, 255.0, 65535.0) if largest <= full), largest)

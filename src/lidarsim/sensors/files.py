@@ -1,6 +1,6 @@
 """Sensors as YAML files: the presets, calibrations of velodyne_pointcloud, and files of users.
 
-A file of ours holds ``name``, ``source``, fields of :class:`SpinningLidar` under ``sensor``, and the
+A file of ours holds ``name``, ``source``, fields of :class:`SpinningLidar` under ``sensor`` and the
 columns of :class:`Lasers` under ``lasers``, highest beam first; angles in ``_deg`` or ``_rad``.
 Columns left out are 0, gains 1. What ``r3dpa data sensor`` adds under ``estimate`` is not read.
 """
@@ -82,24 +82,44 @@ def hdl64e(shots: int = 2083) -> SpinningLidar:
 def write_sensor(
     path: str | Path, content: SensorFile, estimate: Mapping[str, Any] | None = None
 ) -> None:
-    """Write a sensor as a YAML file, atomically, with what is known about its estimate."""
+    """Write a sensor as a YAML file, atomically, with what is known about its estimate.
+
+    Settings and columns that have their default are left out; numbers keep six decimals.
+    """
     import yaml
 
-    settings = asdict(content.sensor)
-    lasers = settings.pop("lasers")
-    columns = {name: [float(value) for value in column] for name, column in lasers.items()}
-    document = {
+    sensor = content.sensor
+    document: dict[str, Any] = {
         "name": content.name,
         "source": content.source,
-        "sensor": settings,
-        "lasers": columns,
-        "estimate": estimate,
+        "sensor": {
+            field.name: getattr(sensor, field.name)
+            for field in fields(SpinningLidar)
+            if field.name != "lasers" and getattr(sensor, field.name) != field.default
+        },
+        "lasers": _columns_of(sensor.lasers),
     }
-    if estimate is None:
-        del document["estimate"]
+    if estimate is not None:
+        document["estimate"] = dict(estimate)
+    text = yaml.safe_dump(document, default_flow_style=None, sort_keys=False, width=100)
     with atomic_path(path) as temporary:
-        text = yaml.safe_dump(document, default_flow_style=None, sort_keys=False, width=100)
         temporary.write_text(text)
+
+
+def _columns_of(lasers: Lasers) -> dict[str, list[float]]:
+    columns = {}
+    for name, values in asdict(lasers).items():
+        default = _default_of(name)
+        if name != "inclination_rad" and all(value == default for value in values):
+            continue
+        if name.endswith("_rad"):
+            name, values = name.replace("_rad", "_deg"), np.degrees(values)
+        columns[name] = [round(float(value), 6) for value in values]
+    return columns
+
+
+def _default_of(column: str) -> float:
+    return 1.0 if column == "intensity_gain" else 0.0
 
 
 @cache
@@ -161,7 +181,7 @@ def _lasers(columns: Mapping[str, Any]) -> Lasers:
         table[in_degrees[name]] = np.radians(table[in_degrees[name]])
     num_beams = len(table["inclination_rad"])
     for name in names:
-        table.setdefault(name, np.full(num_beams, 1.0 if name == "intensity_gain" else 0.0))
+        table.setdefault(name, np.full(num_beams, _default_of(name)))
     return Lasers(**{name: tuple(map(float, table[name])) for name in names})
 
 

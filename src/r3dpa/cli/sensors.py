@@ -27,7 +27,7 @@ def sensors() -> str:
     return text_table(rows, header, "llrrrrl", "plain")
 
 
-def sensor(scans: Path, *, out: Path, limit: PositiveInt = 30) -> str:
+def sensor(scans: Path, *, out: Path, num: PositiveInt = 30) -> str:
     """Estimate a sensor from its scans: beams, columns, range limits, mount.
 
     Writes a YAML file that ``--sensor`` takes, and beside it a picture of the residuals per beam.
@@ -35,7 +35,7 @@ def sensor(scans: Path, *, out: Path, limit: PositiveInt = 30) -> str:
     Args:
         scans: A scan of any format that can be read, or a folder of scans of one sensor.
         out: File to write, ``.yaml``.
-        limit: Maximum number of scans, evenly spaced.
+        num: Maximum number of scans, evenly spaced.
     """
     check_file(out)
     if out.suffix not in (".yaml", ".yml"):
@@ -46,7 +46,7 @@ def sensor(scans: Path, *, out: Path, limit: PositiveInt = 30) -> str:
     from r3dpa.data.scans import evenly
     from r3dpa.io import text_table
 
-    estimated = estimate(evenly(find_files(scans)[1], limit))
+    estimated = estimate(evenly(find_files(scans)[1], num))
     estimated.save(out)
     picture = viz.save(viz.beam_residuals(estimated), out.with_suffix(".png"))
     table = text_table(estimated.rows(), ["quantity", "value", "confidence"], "llr", "plain")
