@@ -1,4 +1,4 @@
-"""``r3dpa data simulate``, ``sensors``, ``sensor``, ``check``, ``view``, ``objects`` and ``realism``."""
+"""``r3dpa data simulate``, ``sensors``, ``sensor``, ``check``, ``view``, ``objects``, and so on."""
 
 import json
 import math

@@ -11,12 +11,12 @@ from lidarsim import LidarSensor, Simulator, load_sensor
 from lidarsim.sensors import PRESETS, SensorFile, read_sensor, write_sensor
 from lidarsim.sensors.files import _FOLDER
 
-# Of the laser tables and settings as they were computed before they became files.
-DIGESTS = {"hdl64e": "13127dacafa62eac", "hdl32e": "3ed810e01e1bb50c", "vls128": "2c5ab6069b5caad4"}
+# Of the laser tables as they were computed before they became files.
+DIGESTS = {"hdl64e": "736df866f3493580", "hdl32e": "c0134b0844499427", "vls128": "447e61c6918173c5"}
 
 
 def digest_of(sensor):
-    return hashlib.sha256(repr(dataclasses.astuple(sensor)).encode()).hexdigest()[:16]
+    return hashlib.sha256(repr(dataclasses.astuple(sensor.lasers)).encode()).hexdigest()[:16]
 
 
 @pytest.mark.parametrize("name", DIGESTS)

@@ -69,14 +69,14 @@ def fit_beams(beam: Indices, distance_m: Floats, z_m: Floats) -> BeamFit:
     order = np.argsort(beam, kind="stable")
     starts = np.searchsorted(beam[order], np.arange(beam.max() + 2))
     slope, height_m, error_m = (np.zeros(len(starts) - 1) for _ in range(3))
-    for number in range(len(starts) - 1):
+    for number in range(len(slope)):
         rows = order[starts[number] : starts[number + 1]]
         slope[number], height_m[number], error_m[number] = _line(inverse[rows], tangent[rows])
     is_sure = error_m < _SURE_HEIGHT_M
     if is_sure.any() and not is_sure.all():
-        places = np.arange(len(is_sure))
-        usual = np.interp(places, places[is_sure], height_m[is_sure])
-        for number in np.flatnonzero(~is_sure):
+        rising = np.flatnonzero(is_sure)[np.argsort(slope[is_sure])]
+        usual = np.interp(slope, slope[rising], height_m[rising])
+        for number in np.flatnonzero(~is_sure).tolist():
             rows = order[starts[number] : starts[number + 1]]
             height_m[number] = usual[number]
             slope[number] = np.median(tangent[rows] - height_m[number] * inverse[rows])

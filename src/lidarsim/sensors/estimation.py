@@ -218,7 +218,7 @@ def estimate_sensor(scans: Sequence[Any] | str | Path) -> SensorEstimate:
         direction,
         sectors,
         columns.dropped_share,
-        None if read[0].cloud.intensity is None else _full_intensity(read),
+        _full_intensity(read),
         mount,
         tuple(notes + mount_notes),
     )
@@ -226,9 +226,13 @@ def estimate_sensor(scans: Sequence[Any] | str | Path) -> SensorEstimate:
 
 def _highest_first(points: BeamPoints, beams: BeamFit) -> tuple[BeamPoints, BeamFit]:
     order = np.argsort(-beams.inclination, kind="stable")
-    inclination, height_m, is_sure = (column[order] for column in beams[:3])
     points = points._replace(beam=np.argsort(order)[points.beam])
-    return points, BeamFit(inclination, height_m, is_sure, beams.residual)
+    return points, BeamFit(
+        beams.inclination[order],
+        beams.height_m[order],
+        beams.is_sure_height[order],
+        beams.residual,
+    )
 
 
 def _pitch(inclination: Floats) -> Floats:
@@ -390,6 +394,9 @@ def _residual_quantiles(beam: Indices, residual: Floats) -> Floats:
     return np.degrees([np.quantile(group, _QUANTILES) for group in groups])
 
 
-def _full_intensity(read: Sequence[SensorScan]) -> float:
-    largest = max(float(np.max(scan.cloud.intensity)) for scan in read)
+def _full_intensity(read: Sequence[SensorScan]) -> float | None:
+    columns = [scan.cloud.intensity for scan in read]
+    largest = max((float(column.max()) for column in columns if column is not None), default=None)
+    if largest is None:
+        return None
     return next((full for full in (1.0, 255.0, 65535.0) if largest <= full), largest)

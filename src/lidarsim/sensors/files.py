@@ -153,7 +153,7 @@ def _content(path: Path, content: Any) -> SensorFile:
     _check_names("section", content, _SECTIONS)
     settings = content.get("sensor") or {}
     _check_names("setting", settings, {field.name for field in fields(SpinningLidar)} - {"lasers"})
-    numbers = {
+    numbers: dict[str, Any] = {
         name: value if name in ("shots", "return_mode") else float(value)
         for name, value in settings.items()
     }

@@ -90,7 +90,8 @@ def _organised_file(path: Path) -> NDArray | None:
 def _returns(array: NDArray) -> tuple[Indices, Indices]:
     """Row and column of the returns of an organised array."""
     xyz = array[..., :3]
-    return np.nonzero(np.isfinite(xyz).all(axis=2) & xyz.any(axis=2))
+    row, column = np.nonzero(np.isfinite(xyz).all(axis=2) & xyz.any(axis=2))
+    return row.astype(np.int64), column.astype(np.int64)
 
 
 def combine(read: Sequence[SensorScan]) -> tuple[BeamPoints, list[str]]:

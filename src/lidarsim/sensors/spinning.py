@@ -64,6 +64,7 @@ class SpinningLidar:
     divergence), KITTI-360 (mount, spin).
 
     Example:
+        >>> from lidarsim import load_sensor
         >>> sensor = load_sensor("hdl32e")
         >>> sensor.num_beams, sensor.rays.direction.shape
         (32, (3, 32, 2170))
