@@ -71,6 +71,17 @@ def test_a_ring_column_serves_shuffled_points_numbered_from_below(vlp16_scans):
     assert largest_difference_deg(estimated, ("inclination_rad", inclination_rad)) < 0.02
 
 
+def test_scans_that_lack_beams_are_combined_by_inclination(vlp16_scans):
+    rows = vlp16_scans[0]
+    degrees = np.degrees(np.arctan2(rows[:, 2], np.hypot(rows[:, 0], rows[:, 1])))
+    lacking = rows[np.abs(degrees - 5) > 0.5]
+    estimated = estimate([lacking, *vlp16_scans[1:]])
+    assert estimated.sensor.num_beams == 16
+    inclination_rad = load_sensor("vlp16").lasers.inclination_rad
+    assert largest_difference_deg(estimated, ("inclination_rad", inclination_rad)) < 0.02
+    assert "1 of 3 scans show fewer than 16 beams" in estimated.notes
+
+
 def test_shuffled_points_without_ring_show_their_beams(vlp16_scans):
     generator = np.random.default_rng(0)
     estimated = estimate([generator.permutation(rows) for rows in vlp16_scans])
@@ -157,7 +168,7 @@ def test_scans_that_show_no_spinning_sensor_are_refused(vlp16_scans):
         estimate([np.zeros((100, 4), np.float32)])
     with pytest.raises(ValueError, match="no metres: divide"):
         estimate([rows * np.float32([1000, 1000, 1000, 1])])
-    with pytest.raises(ValueError, match=r"shows 16 beams, .* 32: give scans of one sensor"):
+    with pytest.raises(ValueError, match=r"shows 32 beams, .* 16: give scans of one sensor"):
         estimate([*vlp16_scans, scans_of("hdl32e", 1)[0]])
     down = rows * np.float32([1, -1, -1, 1])
     with pytest.raises(ValueError, match="above the sensor: turn the points so that z points up"):

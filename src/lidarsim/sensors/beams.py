@@ -17,7 +17,9 @@ Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-_ROUNDS = 8  # of reweighted least squares
+_ROUNDS = 10  # of reweighted least squares
+# The first rounds minimise the absolute residual of points that are not near.
+_START_ROUNDS, _START_REACH = 4, 3.0
 _TUKEY = 4.685  # times the scale of the residuals; beyond it a point has no weight
 _LEAST_SCALE_RAD = 1e-6  # of float32 coordinates
 _SURE_HEIGHT_M = 0.02  # heights of larger standard error are those of the other beams
@@ -88,9 +90,10 @@ def _line(x: Floats, y: Floats) -> tuple[float, float, float]:
     """Robust offset and slope of ``y`` over ``x``, and the standard error of the slope."""
     if len(x) < 3:
         return float(np.median(y)), 0.0, math.inf
-    offset, slope, weight = float(np.median(y)), 0.0, np.ones(len(x))
+    is_far = x <= _START_REACH * np.median(x)  # near points have a large say in the slope
+    offset, slope, weight = float(np.median(y)), 0.0, is_far + 0.0
     spread = 0.0
-    for _ in range(_ROUNDS):
+    for attempt in range(_ROUNDS):
         total = weight.sum()
         mean_x, mean_y = (weight @ x) / total, (weight @ y) / total
         spread = float(weight @ np.square(x - mean_x))
@@ -99,6 +102,8 @@ def _line(x: Floats, y: Floats) -> tuple[float, float, float]:
         residual = np.abs(y - offset - slope * x)
         scale = max(1.4826 * float(np.median(residual)), _LEAST_SCALE_RAD)
         weight = np.square((1 - np.square(residual / (_TUKEY * scale))).clip(0))
+        if attempt < _START_ROUNDS:
+            weight = is_far / np.maximum(residual, scale)
     error = scale / math.sqrt(spread) if spread > 0 else math.inf
     return offset, slope, error
 

@@ -5,7 +5,6 @@ Letters: P points, H beams, W columns.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,7 +16,7 @@ from lidarsim.clouds import PointCloud, read_cloud, suffix_of
 from lidarsim.recorded import RecordedScan
 from lidarsim.rings import Rings, rings_of
 from lidarsim.scan_files import ScanError
-from lidarsim.sensors.beams import nearest_line, search_beams
+from lidarsim.sensors.beams import BeamFit, fit_beams, nearest_line, search_beams
 from lidarsim.weather import recorded_scan
 
 Floats = NDArray[np.float64]
@@ -25,6 +24,9 @@ Indices = NDArray[np.int64]
 
 LEAST_DISTANCE_M = 0.1  # of points of a beam, in the plane: nearer ones have no azimuth
 _FEWEST_BEAMS = 4
+_LEAST_SHARE = 0.6  # of the beams of the fullest scan; a scan with fewer is of another sensor
+_FEW_POINTS = 0.1  # of a ring off its line
+_SAME_BEAM_SHARE = 0.15  # of the pitch between the same beam of two scans
 WORKS_STILL = "`r3dpa data weather`, `r3dpa data view` and metrics on points still take such scans"
 
 
@@ -95,21 +97,23 @@ def _returns(array: NDArray) -> tuple[Indices, Indices]:
 
 
 def combine(read: Sequence[SensorScan]) -> tuple[BeamPoints, list[str]]:
-    """Points of all scans that show the same beams, and notes about the others."""
+    """Points of all scans with their beams, and notes about the scans."""
     notes: list[str] = []
     rings = _with_searched_beams(read, [rings_of(recorded_scan(scan.cloud)) for scan in read])
-    counts = Counter(ring.num_rings for ring in rings)
-    usual = counts.most_common(1)[0][0]
+    most = max(range(len(read)), key=lambda i: rings[i].num_rings)
+    usual = rings[most].num_rings
     is_stored = all(ring.how == "stored" for ring in rings)
     odd = [i for i, ring in enumerate(rings) if ring.num_rings != usual]
-    if odd and (2 * len(odd) > len(read) or any(_is_other(rings[i].num_rings, usual) for i in odd)):
-        same = next(i for i, ring in enumerate(rings) if ring.num_rings == usual)
-        raise ValueError(
-            f"{read[same].name} shows {usual} beams, {read[odd[0]].name} "
-            f"{rings[odd[0]].num_rings}: give scans of one sensor"
-        )
+    other = next((i for i in odd if rings[i].num_rings < _LEAST_SHARE * usual), None)
     if odd and not is_stored:
-        notes.append(f"{len(odd)} of {len(read)} scans show other than {usual} beams: left out")
+        rings, strange = _with_common_beams(read, rings, most)
+        other = strange if other is None else other
+        notes.append(f"{len(odd)} of {len(read)} scans show fewer than {usual} beams")
+    if other is not None:
+        raise ValueError(
+            f"{read[most].name} shows {usual} beams, {read[other].name} "
+            f"{rings[other].num_rings}: give scans of one sensor"
+        )
     unsure = next((i for i, ring in enumerate(rings) if ring.sure == 0), None)
     if usual < _FEWEST_BEAMS or unsure is not None:
         name = read[unsure or 0].name
@@ -117,10 +121,8 @@ def combine(read: Sequence[SensorScan]) -> tuple[BeamPoints, list[str]]:
             f"{name}: no beams found, as in scans of solid-state or non-repetitive LiDARs, which "
             f"have none; {WORKS_STILL}"
         )
-    used = [i for i in range(len(read)) if is_stored or i not in odd]
     parts, columns = [], []
-    for number in used:
-        scan, ring = read[number], rings[number]
+    for number, (scan, ring) in enumerate(zip(read, rings, strict=True)):
         beam = np.asarray(scan.cloud.ring).astype(np.int64) if is_stored else ring.ring
         xyz = scan.cloud.points.astype(float)
         keep = np.hypot(xyz[:, 0], xyz[:, 1]) > LEAST_DISTANCE_M
@@ -130,7 +132,7 @@ def combine(read: Sequence[SensorScan]) -> tuple[BeamPoints, list[str]]:
     organised = [column for column in columns if column is not None]
     column = np.concatenate(organised) if len(organised) == len(columns) else None
     beam = np.unique(beam, return_inverse=True)[1]
-    how = "a stored ring" if is_stored else "the " + rings[used[0]].how
+    how = "a stored ring" if is_stored else "the " + rings[most].how
     return BeamPoints(xyz, beam, place, column, how), notes
 
 
@@ -177,6 +179,38 @@ def _beams_by_alice(some: NDArray, distance_m: Floats, z_m: Floats) -> Indices |
     return np.unique(beam, return_inverse=True)[1]
 
 
-def _is_other(num_beams: int, usual: int) -> bool:
-    """Whether a number of beams is that of another sensor, rather than of a beam without points."""
-    return not 0.8 * usual <= num_beams <= 1.25 * usual
+def _with_common_beams(
+    read: Sequence[SensorScan], rings: list[Rings], most: int
+) -> tuple[list[Rings], int | None]:
+    """Rings numbered alike in all scans, by their inclination, as some scans lack some beams.
+
+    The second value is a scan most of whose beams are none of the others, or None.
+    """
+    lines = _fit(read[most], rings[most])
+    known, height_m = lines.inclination, lines.height_m
+    strange, numbered = None, list(rings)
+    for number in sorted(range(len(read)), key=lambda i: -rings[i].num_rings):
+        ring = rings[number].ring
+        lines = _fit(read[number], rings[number])
+        near = _SAME_BEAM_SHARE * np.median(-np.diff(np.sort(known)[::-1]))
+        is_new = np.abs(lines.inclination[:, None] - known).min(axis=1) > near
+        if 2 * np.count_nonzero(is_new) > len(is_new):
+            strange = number
+        # Sparse beams without a wrap between them are one ring, far from a line.
+        off_line = np.bincount(ring, np.abs(lines.residual) > near) / np.bincount(ring)
+        is_new &= off_line < _FEW_POINTS
+        known = np.append(known, lines.inclination[is_new])
+        height_m = np.append(height_m, lines.height_m[is_new])
+        beam, _ = nearest_line(known, height_m, *_place(read[number]))
+        numbered[number] = rings[number]._replace(ring=beam)
+    return numbered, strange
+
+
+def _place(scan: SensorScan) -> tuple[Floats, Floats]:
+    """Distance in the horizontal plane, and height, of the points ``(P,)``."""
+    xyz = scan.cloud.points.astype(float)
+    return np.hypot(xyz[:, 0], xyz[:, 1]).clip(LEAST_DISTANCE_M), xyz[:, 2]
+
+
+def _fit(scan: SensorScan, rings: Rings) -> BeamFit:
+    return fit_beams(rings.ring, *_place(scan))
