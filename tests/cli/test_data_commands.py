@@ -98,8 +98,8 @@ class TestSimulate:
     @pytest.mark.parametrize(
         ("words", "message"),
         [
-            (["--effects.fogg", "off"], "there is no effect 'fogg'; there are dual_return, "),
-            (["--sensor", "hdl65e"], r"unknown sensor 'hdl65e' \(did you mean 'hdl64e'\?\); choose from "),
+            (["--effects.fogg", "off"], "unknown effect 'fogg'; choose from dual_return, "),
+            (["--sensor", "hdl65e"], r"'hdl65e' \(did you mean 'hdl64e'\?\); choose"),
             (["--weather.rain_mm_h", "-1"], "^rain_mm_h must be 0 or greater, got -1"),
         ],
     )

@@ -22,7 +22,7 @@ _ROUNDS = 10  # of reweighted least squares
 _START_ROUNDS, _START_REACH = 4, 3.0
 _TUKEY = 4.685  # times the scale of the residuals; beyond it a point has no weight
 _LEAST_SCALE_RAD = 1e-6  # of float32 coordinates
-_SURE_HEIGHT_M = 0.02  # heights of larger standard error are those of the other beams
+_SURE_HEIGHT_M = 0.02  # heights of larger standard error are interpolated
 _MOST_LATERAL_M = 0.1
 _UNBROKEN = 1.35  # times the median step of azimuth
 _SAME_SURFACE = 0.05  # relative difference of distance of neighbours on a surface
@@ -111,7 +111,7 @@ def _line(x: Floats, y: Floats) -> tuple[float, float, float]:
 def fit_columns(beam: Indices, azimuth: Floats, distance_m: Floats, scan: Indices) -> ColumnFit:
     """Fit columns per turn, lateral offset and azimuth offset of each beam.
 
-    The step of azimuth is first that of neighbours on a surface; their steps at the edges of
+    The step of azimuth is first measured between neighbours on a surface; their steps at the edges of
     surfaces show the lateral offset of the beam. The number of columns is then the one near the
     first guess for which the azimuths of each beam and scan are most coherent::
 
@@ -246,7 +246,7 @@ def search_beams(beam: Indices, distance_m: Floats, z_m: Floats) -> Indices | No
 def nearest_line(
     inclination: Floats, height_m: Floats, distance_m: Floats, z_m: Floats
 ) -> tuple[Indices, Floats]:
-    """Line ``(P,)`` whose angle is nearest to that of each point, and the difference."""
+    """Line ``(P,)`` whose angle is nearest to each point, and the difference."""
     nearest, least = np.zeros(len(z_m), np.int64), np.full(len(z_m), np.inf)
     for number in range(len(inclination)):
         off = np.abs(np.arctan2(z_m - height_m[number], distance_m) - inclination[number])

@@ -35,13 +35,13 @@ _NEAR_LINE_SHARE, _NEAR_LINE_DEG = 0.15, 0.02  # of the pitch, and of the angle,
 _KNOWN_BEAM_SHARE = 0.5
 _FEWEST_NEAR_SHARE = 0.6
 _SMEAR_DEG = 0.02
-_MIXED_SHARE = 0.3  # of the pitch between the beams of one scan and those of all
+_MIXED_SHARE = 0.3  # of the pitch between the beams of one scan and of all scans
 _COHERENT = 0.5
 _DOUBLE_SHARE = 0.05
 _SECTOR_DEG, _WHOLE_TURN_DEG = 2, 350
 _FEW_POINTS = 0.02  # of the median of all degrees of azimuth: a blind sector has fewer
 _GROUND_M, _FEWEST_GROUND_POINTS = 25.0, 200
-_VEHICLE_HEIGHT_M = 0.5  # centres above the origin by more are those of a vehicle's frame
+_VEHICLE_HEIGHT_M = 0.5  # more above the origin: frame of a vehicle
 _QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 
 
@@ -59,7 +59,7 @@ class SensorEstimate:
     """A sensor as scans show it.
 
     Args:
-        sensor: Its beams, columns, range limits and height; other fields are those of the HDL-64E.
+        sensor: Its beams, columns, range limits and height; the rest is as for the HDL-64E.
         num_scans: Number of scans that were combined.
         beams_by: ``stored``, ``order`` or ``inclination``, see :func:`lidarsim.rings.rings_of`.
         confidence: Share from 0 to 1 by quantity.
@@ -139,7 +139,7 @@ class SensorEstimate:
 def estimate_sensor(scans: Sequence[Any] | str | Path) -> SensorEstimate:
     """Estimate the sensor that recorded scans, all of one sensor.
 
-    Beams are those of a ring column or of an organised array; otherwise those of the order of the
+    Beams come from a ring column or the rows of an organised array; otherwise from the order of the
     file, or of the peaks of the inclination. Each beam is then a line in the plane of distance and
     height, so that its optical centre is known too. Azimuth offsets are those within one column,
     unless the array is organised, where they are those from the direction of the column.
@@ -177,7 +177,7 @@ def estimate_sensor(scans: Sequence[Any] | str | Path) -> SensorEstimate:
     azimuth = np.arctan2(points.xyz[:, 1], points.xyz[:, 0])
     columns = fit_columns(points.beam, azimuth, distance_m, points.scan)
     if columns.coherence < _COHERENT:
-        notes.append("azimuths lie on no common steps: the columns are those of the mean step")
+        notes.append("azimuths lie on no common steps: the columns follow from the mean step")
     direction, head = _rotation(read, points, azimuth)
     num_columns, offset, sure_columns = columns.columns, columns.offset, columns.coherence
     if points.column is not None and head is not None:
@@ -259,7 +259,7 @@ def _check_spinning(points: BeamPoints, beams: BeamFit) -> float:
 
 
 def _disagreement(points: BeamPoints, beams: BeamFit, names: Sequence[str]) -> list[str]:
-    """Note about the scan whose beams are farthest from those of all scans."""
+    """Note about the scan whose beams lie farthest from the common ones."""
     numbers = np.unique(points.scan)
     if len(numbers) < 2:
         return []
@@ -274,11 +274,11 @@ def _disagreement(points: BeamPoints, beams: BeamFit, names: Sequence[str]) -> l
     typical, most, number = largest
     if typical > _MIXED_SHARE * np.median(_pitch(beams.inclination)):
         raise ValueError(
-            f"{names[number]}: its beams lie {np.degrees(typical):.2f} degrees from those of the "
-            "other scans: give scans of one sensor"
+            f"{names[number]}: its beams lie {np.degrees(typical):.2f} degrees from the beams of "
+            "the other scans: give scans of one sensor"
         )
     return [
-        f"beams of single scans lie within {np.degrees(most):.4f} degrees of those of all "
+        f"beams of single scans lie within {np.degrees(most):.4f} degrees of the common beams of all "
         f"{len(numbers)} (largest in {names[number]})"
     ]
 
@@ -353,7 +353,11 @@ def _mount(read: Sequence[SensorScan], beams: BeamFit) -> tuple[Floats, Mount | 
         )
         height_m = height_m - shift_m
     if not planes:
-        return height_m, None, [*notes, "little ground is seen: the mount is that of the HDL-64E"]
+        return (
+            height_m,
+            None,
+            [*notes, "little ground is seen: the mount of the HDL-64E is assumed"],
+        )
     slopes = np.median(planes, axis=0)
     heights = np.array([plane[2] for plane in planes])
     above_m = (shift_m if is_shifted else 0.0) - float(np.median(heights))
