@@ -111,7 +111,7 @@ def _line(x: Floats, y: Floats) -> tuple[float, float, float]:
 def fit_columns(beam: Indices, azimuth: Floats, distance_m: Floats, scan: Indices) -> ColumnFit:
     """Fit columns per turn, lateral offset and azimuth offset of each beam.
 
-    The step of azimuth is first measured between neighbours on a surface; their steps at the edges of
+    The step of azimuth is first measured between neighbours on a surface; their steps at edges of
     surfaces show the lateral offset of the beam. The number of columns is then the one near the
     first guess for which the azimuths of each beam and scan are most coherent::
 

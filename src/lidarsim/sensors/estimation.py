@@ -278,7 +278,7 @@ def _disagreement(points: BeamPoints, beams: BeamFit, names: Sequence[str]) -> l
             "the other scans: give scans of one sensor"
         )
     return [
-        f"beams of single scans lie within {np.degrees(most):.4f} degrees of the common beams of all "
+        f"beams of single scans lie within {np.degrees(most):.4f} degrees of the beams of all "
         f"{len(numbers)} (largest in {names[number]})"
     ]
 
