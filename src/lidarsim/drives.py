@@ -25,7 +25,8 @@ from lidarsim.drive_files import DriveFiles, drive_name, to_json, weather_to_dic
 from lidarsim.io import differences, in_processes, json_values, only_writer, text_table
 from lidarsim.scan import Simulator, check_switches
 from lidarsim.scene import Conditions, Semantic
-from lidarsim.sensors.spinning import SpinningLidar, load_sensor
+from lidarsim.sensors.files import load_sensor
+from lidarsim.sensors.spinning import SpinningLidar
 
 TRAIN_DRIVES = ("0003", "0004", "0005", "0006", "0007", "0009", "0010")
 VAL_DRIVES = ("0000", "0002")
@@ -109,8 +110,8 @@ def simulate(
         drives: Four-digit drives, such as ``0000 0003``; default: all of training and validation.
             With drives of both splits, a fifth of the scans (at least one, if there are two or
             more) is for validation.
-        sensor: ``hdl64e``, ``hdl32e``, ``vls128``, or a calibration YAML as ``velodyne_pointcloud``
-            reads, for an HDL-64E; in Python any instrument.
+        sensor: Preset of ``r3dpa data sensors``, or a YAML of ``r3dpa data sensor`` or of
+            ``velodyne_pointcloud``, for an HDL-64E; in Python any instrument.
         return_mode: Strongest return of each shot, or the two strongest; default: as the sensor.
         effects: ``off`` or ``auto`` by effect, such as ``--effects.fog off``; default: ``auto``.
         weather: Weather of all scans, such as ``--weather.rain_mm_h 10``; default: drawn for each

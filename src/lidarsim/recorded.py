@@ -19,7 +19,8 @@ from lidarsim.draws import Draws
 from lidarsim.ground import ground_of
 from lidarsim.scan import damped_intensity, power_of_intensity
 from lidarsim.scene import Material, Primitive, Scene
-from lidarsim.sensors.spinning import Lasers, SpinningLidar, load_sensor
+from lidarsim.sensors.files import load_sensor
+from lidarsim.sensors.spinning import Lasers, SpinningLidar
 from lidarsim.solids import GROUND, NO_SURFACE, Floats, Solids
 from lidarsim.sweep import Echoes, Sweep
 

@@ -15,7 +15,8 @@ from scipy.special import lambertw
 from lidarsim.draws import Draws
 from lidarsim.effects import ECHO_EFFECTS, EFFECTS, RAY_EFFECTS
 from lidarsim.scene import Conditions, Scene
-from lidarsim.sensors.spinning import SpinningLidar, load_sensor
+from lidarsim.sensors.files import load_sensor
+from lidarsim.sensors.spinning import SpinningLidar
 from lidarsim.street import Street
 from lidarsim.sweep import Echoes, Effect, Origin, Sweep
 

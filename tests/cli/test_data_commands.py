@@ -1,4 +1,4 @@
-"""``r3dpa data simulate``, ``check``, ``view``, ``objects`` and ``realism``."""
+"""``r3dpa data simulate``, ``sensors``, ``sensor``, ``check``, ``view``, ``objects``, and so on."""
 
 import json
 import math
@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 from tiny_networks import SIT_ARGS
 
-from lidarsim import Origin, Semantic, simulate
+from lidarsim import Origin, Semantic, load_sensor, simulate
 from lidarsim.scan_files import ScanError, read_scan, write_bin, write_npz, write_ply
 from r3dpa.cli import main
 from r3dpa.cli.data import objects, view
@@ -27,6 +27,33 @@ def simulated(tmp_path_factory):
     root = tmp_path_factory.mktemp("simulated")
     simulate(root, 4, drives=["0003", "0004"])
     return root
+
+
+class TestSensors:
+    """Presets, and a sensor estimated from scans."""
+
+    def test_presets_are_listed_with_their_source(self, capsys):
+        main(["data", "sensors"])
+        lines = capsys.readouterr().out.splitlines()
+        row = next(line for line in lines if line.startswith("hdl32e"))
+        assert re.search(r"32 +2170 +\+10\.67 to -30\.67 +0\.9 to 100 +Datasheet", row)
+        assert any(line.startswith("os1_128") for line in lines)
+
+    def test_an_estimate_is_a_file_for_simulate_and_a_picture(self, simulated, tmp_path, capsys):
+        out = tmp_path / "mine.yaml"
+        main(["data", "sensor", str(simulated), "--out", str(out), "--num", "2"])
+        text = capsys.readouterr().out
+        assert re.search(r"beams +64 by the order +100%", text)
+        assert re.search(r"columns +2083", text)
+        assert load_sensor(out).num_beams == 64
+        with Image.open(tmp_path / "mine.png") as picture:
+            assert picture.size[0] > 500
+
+    def test_nothing_is_written_where_scans_are_refused(self, tmp_path):
+        write_bin(tmp_path / "scan.bin", np.ones((10, 4), np.float32))
+        with pytest.raises(ScanError, match="holds 10 of at least 16 points"):
+            main(["sensor", str(tmp_path / "scan.bin"), "--out", str(tmp_path / "mine.yaml")])
+        assert [path.name for path in tmp_path.iterdir()] == ["scan.bin"]
 
 
 class TestSimulate:
@@ -72,7 +99,7 @@ class TestSimulate:
         ("words", "message"),
         [
             (["--effects.fogg", "off"], "unknown effect 'fogg'; choose from dual_return, "),
-            (["--sensor", "hdl65e"], "unknown sensor 'hdl65e'; choose from hdl64e, "),
+            (["--sensor", "hdl65e"], r"'hdl65e' \(did you mean 'hdl64e'\?\); choose"),
             (["--weather.rain_mm_h", "-1"], "^rain_mm_h must be 0 or greater, got -1"),
         ],
     )

@@ -284,7 +284,7 @@ BAD = {
     "negative": (["--weather.visibility_m", "-5"], "visibility_m must be 1 or greater"),
     "rain": (["--weather.rain_mm_h", "10000"], "rain_mm_h must be at most"),
     "effect": ([*FOG, "--effects.glass", "on"], "effect glass cannot act on a recorded scan"),
-    "sensor": ([*FOG, "--instrument.sensor", "hdl99"], "'hdl99'; choose from hdl64e"),
+    "sensor": ([*FOG, "--instrument.sensor", "hdl99"], "'hdl99'; choose from hdl32e"),
     "columns": ([*FOG, "--columns", "x,y,i"], "not a multiple of 12 (x, y, i as float32)"),
 }
 

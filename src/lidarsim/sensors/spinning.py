@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
-from functools import cache, lru_cache
-from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from dataclasses import dataclass, fields
+from functools import lru_cache
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,21 +13,6 @@ from numpy.typing import NDArray
 from lidarsim.scene import check_fields
 
 _LIGHT_M_S = 299_792_458.0
-_BLOCK_BEAMS = 32
-# HDL-64E as fitted to scans of KITTI (z = height + r tan(elevation) for each laser, residual below
-# 1 mm): (highest, lowest, standard deviation of the step) of each block's elevations in degrees,
-# optical centres, sign of the lateral offset, spread of bias and gain. The azimuth offsets are from
-# the S3 calibration of ros-drivers; its elevations (1.96 ... -8.56, -8.78 ... -24.56) end 0.4
-# degrees higher than KITTI's.
-_UPPER_BLOCK_DEG = (1.94, -8.71, 0.045)
-_LOWER_BLOCK_DEG = (-9.03, -25.00, 0.070)
-_UPPER_HEIGHTS_M = (0.209, 0.198)
-_LOWER_HEIGHTS_M = (0.126, 0.116)
-_AZIMUTH_COLUMNS_DEG = (-8.5, 3.7, -2.4, 9.9)
-_LATERAL_OFFSET_M = 0.026
-_BIAS_SD_M = 0.025
-_GAIN_SD = 0.2
-_IRREGULARITIES_SEED = 64
 
 
 class Rays(NamedTuple):
@@ -80,6 +64,7 @@ class SpinningLidar:
     divergence), KITTI-360 (mount, spin).
 
     Example:
+        >>> from lidarsim import load_sensor
         >>> sensor = load_sensor("hdl32e")
         >>> sensor.num_beams, sensor.rays.direction.shape
         (32, (3, 32, 2170))
@@ -148,123 +133,6 @@ class SpinningLidar:
         ends looking backwards.
         """
         return _time_s(self.lasers, self.shots, self.spin_hz)
-
-
-def hdl64e(shots: int = 2083) -> SpinningLidar:
-    """Velodyne HDL-64E as mounted on the recording car of KITTI-360, 2083 shots at 10 Hz."""
-    return SpinningLidar(_hdl64e_lasers(), shots)
-
-
-def hdl32e() -> SpinningLidar:
-    """Velodyne HDL-32E: 32 beams from +10.67 to -30.67 degrees, 2170 shots at 10 Hz.
-
-    Source: the datasheet.
-    """
-    lasers = _lasers(np.radians(np.linspace(10.67, -30.67, 32)))
-    return SpinningLidar(lasers, 2170, min_range_m=0.9, max_range_m=100.0)
-
-
-def vls128() -> SpinningLidar:
-    """Velodyne VLS-128: 128 beams from +15 to -25 degrees, 0.11 degrees apart around the horizon.
-
-    Source: beam angles of ros-drivers/velodyne; the datasheet (1800 shots at 10 Hz, 245 m).
-    """
-    above = (15, 11.75, 9.7, 8.43, 7.58, 6.98, 6.48, 6.08, 5.73, 5.43, 5.18, 4.98, 4.83)
-    below = (6.65, 6.85, 7.15, 7.65, 8.35, 9.24, 10.35, 11.74, 13.57, 16.04, 19.58, 25)
-    inclination_deg = np.concatenate([above, np.linspace(4.72, -6.5, 103), np.negative(below)])
-    columns_deg = (4.548, 2.732, 0.911, -0.911, -2.732, -4.548, -6.354, 6.354)
-    lasers = _lasers(
-        np.radians(inclination_deg), azimuth_offset_rad=np.radians(np.resize(columns_deg, 128))
-    )
-    return SpinningLidar(lasers, 1800, min_range_m=0.9, max_range_m=245.0, min_power=3.4e-6)
-
-
-PRESETS = {"hdl64e": hdl64e, "hdl32e": hdl32e, "vls128": vls128}
-
-
-def load_sensor(model: str, **changes: Any) -> SpinningLidar:
-    """A sensor by its name, or an HDL-64E with the laser table of a calibration file.
-
-    Args:
-        model: One of ``PRESETS``, or a YAML file as ``velodyne_pointcloud`` of ros-drivers reads:
-            a list ``lasers`` with ``vert_correction`` and ``rot_correction`` in radians and
-            ``vert_offset_correction`` and ``horiz_offset_correction`` in metres.
-        changes: Other values for fields of :class:`SpinningLidar`.
-    """
-    if model in PRESETS:
-        return replace(PRESETS[model](), **changes)
-    path = Path(model)
-    if not path.is_file():
-        raise ValueError(
-            f"unknown sensor {model!r}; choose from {', '.join(PRESETS)}, or give a calibration "
-            "YAML"
-        )
-    return SpinningLidar(_read_calibration(path), **changes)
-
-
-def _read_calibration(path: Path) -> Lasers:
-    import yaml  # the presets do not need it
-
-    try:
-        content = yaml.safe_load(path.read_text())
-        table = sorted(content["lasers"], key=lambda laser: -laser["vert_correction"])
-        columns = {
-            name: np.array([float(laser.get(key, 0.0)) for laser in table])
-            for name, key in (
-                ("inclination_rad", "vert_correction"),
-                ("azimuth_offset_rad", "rot_correction"),
-                ("height_m", "vert_offset_correction"),
-                ("lateral_m", "horiz_offset_correction"),
-            )
-        }
-    except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(
-            f"{path} is not a calibration of velodyne_pointcloud ({error!r}): it needs a list "
-            f"`lasers`, each with at least vert_correction (radians)"
-        ) from error
-    try:
-        return _lasers(**columns)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
-
-
-def _lasers(inclination_rad: NDArray[np.float64], **columns: NDArray[np.float64]) -> Lasers:
-    """Laser table of these columns; missing gains are 1, other missing values 0."""
-    zeros = np.zeros(len(inclination_rad))
-    table = {field.name: zeros for field in fields(Lasers)} | {"intensity_gain": zeros + 1}
-    table |= {"inclination_rad": inclination_rad} | columns
-    return Lasers(*(tuple(map(float, column)) for column in table.values()))
-
-
-def _block_inclinations(
-    block_deg: tuple[float, float, float], generator: np.random.Generator
-) -> NDArray[np.float64]:
-    """Falling inclinations (32,) in degrees with the block's exact ends and irregular steps."""
-    highest, lowest, step_sd = block_deg
-    mean_step = (highest - lowest) / (_BLOCK_BEAMS - 1)
-    steps = generator.normal(mean_step, step_sd, _BLOCK_BEAMS - 1).clip(min=mean_step / 4)
-    return highest - np.append(0.0, steps.cumsum() * (highest - lowest) / steps.sum())
-
-
-@cache
-def _hdl64e_lasers() -> Lasers:
-    generator = np.random.Generator(np.random.Philox(_IRREGULARITIES_SEED))
-    inclination_deg = np.concatenate(
-        [_block_inclinations(block, generator) for block in (_UPPER_BLOCK_DEG, _LOWER_BLOCK_DEG)]
-    )
-    beams = np.arange(2 * _BLOCK_BEAMS)
-    lowest_deg, highest_deg = min(_AZIMUTH_COLUMNS_DEG), max(_AZIMUTH_COLUMNS_DEG)
-    offset_deg = np.take(_AZIMUTH_COLUMNS_DEG, beams % 4) + generator.normal(0.0, 0.3, len(beams))
-    return _lasers(
-        inclination_rad=np.radians(inclination_deg),
-        azimuth_offset_rad=np.radians(offset_deg.clip(lowest_deg, highest_deg)),
-        height_m=np.concatenate(
-            [np.linspace(*ends, _BLOCK_BEAMS) for ends in (_UPPER_HEIGHTS_M, _LOWER_HEIGHTS_M)]
-        ),
-        lateral_m=np.where(beams % 2 == 0, -_LATERAL_OFFSET_M, _LATERAL_OFFSET_M),
-        range_bias_m=generator.normal(0.0, _BIAS_SD_M, len(beams)),
-        intensity_gain=np.exp(generator.normal(0.0, _GAIN_SD, len(beams))),
-    )
 
 
 def _azimuth(lasers: Lasers, shots: int) -> NDArray[np.float64]:

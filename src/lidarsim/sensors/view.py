@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+
+from lidarsim.sensors.files import load_sensor
+from lidarsim.sensors.spinning import SpinningLidar
 
 
 @dataclass(frozen=True)
@@ -53,6 +57,30 @@ class LidarSensor:
                 "the range limits must satisfy 0 <= min < max < infinity metres, got "
                 f"range_min_m={self.range_min_m}, range_max_m={self.range_max_m}"
             )
+
+    @classmethod
+    def of(cls, model: str | Path | SpinningLidar, columns: int | None = None) -> LidarSensor:
+        """Return the range image of a sensor: a row per beam, half a pitch around the outer ones.
+
+        Args:
+            model: Sensor, or what :func:`lidarsim.load_sensor` takes: a preset or a YAML file.
+            columns: Columns of the image; default: the shots of a turn.
+
+        Example:
+            >>> LidarSensor.of("vlp16", columns=1024).inclination_max_deg
+            16.0
+        """
+        sensor = model if isinstance(model, SpinningLidar) else load_sensor(model)
+        degrees = np.degrees(sensor.lasers.inclination_rad)
+        first, last = (degrees[:2], degrees[-2:]) if len(degrees) > 1 else ((1, -1), (1, -1))
+        return cls(
+            beams=sensor.num_beams,
+            columns=columns or sensor.shots,
+            inclination_max_deg=round(float(degrees[0] + (first[0] - first[1]) / 2), 6),
+            inclination_min_deg=round(float(degrees[-1] - (last[0] - last[1]) / 2), 6),
+            range_min_m=sensor.min_range_m,
+            range_max_m=sensor.max_range_m,
+        )
 
     def cell_size(self, grid_size: tuple[int, int]) -> tuple[int, int]:
         """Rows and columns of pixels in one cell of a grid ``(rows, columns)``."""

@@ -33,6 +33,8 @@ COMMANDS = {
     "data view": Command("data:view", "draw scans: pictures and a page with point clouds"),
     "data features": Command("fit:features", "write feature grids of scans", resumable=True),
     "data objects": Command("data:objects", "write mean features of object classes for inpaint"),
+    "data sensors": Command("sensors:sensors", "list sensor presets"),
+    "data sensor": Command("sensors:sensor", "estimate a sensor from its scans"),
     "data reference": Command("evaluate:reference", "write statistics of real scans", True),
     "data weather": Command("weather:weather", "simulate weather on recorded scans", True),
     "data corrupt": Command("weather:corrupt", "add sensor faults to recorded scans", True),

@@ -89,7 +89,7 @@ class SimulatedImageDataModule(LidarDataModule):
         every: Stride in scans of a drive; neighbours are 0.1 s apart.
         num_scans: Scans to simulate, over all drives; 2 or more, a fifth of them held out.
         simulation_seed: Seed of streets and instrument.
-        simulation_sensor: Instrument: ``hdl64e``, ``hdl32e``, ``vls128`` or a calibration file;
+        simulation_sensor: Instrument: preset of ``r3dpa data sensors`` or a YAML file;
             ``sensor`` is about the range images.
         effects: ``auto``, ``on`` or ``off`` by effect; those not named are ``auto``.
         weather: Weather of all scans; drawn where None.

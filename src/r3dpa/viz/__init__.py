@@ -30,6 +30,7 @@ from r3dpa.viz.pictures import (
     save,
     scene_3d,
 )
+from r3dpa.viz.sensors import beam_residuals
 
 __all__ = [
     "Category",
@@ -38,6 +39,7 @@ __all__ = [
     "ParetoPoint",
     "Series",
     "Tile",
+    "beam_residuals",
     "birds_eye_picture",
     "birds_eye_sheet",
     "birds_eye_view",
