@@ -17,7 +17,7 @@ from lidarsim.scene import (
     Semantic,
     Shape,
 )
-from lidarsim.sensors.spinning import hdl32e, hdl64e, vls128
+from lidarsim.sensors import hdl64e, load_sensor
 
 # Usual values of an instrument twice or more, and odd ones.
 INSTRUMENT = {
@@ -63,7 +63,7 @@ class Dice:
 def random_case(seed):
     """Scene and sensor of a seed; a scan of them takes some milliseconds."""
     dice = Dice(seed)
-    sensor = dice.among(hdl64e(), hdl64e(), hdl64e(), hdl32e(), vls128())
+    sensor = dice.among(hdl64e(), hdl64e(), hdl64e(), load_sensor("hdl32e"), load_sensor("vls128"))
     table = INSTRUMENT | ({} if dice.chance(0.25) else NOISE)
     if table.keys().isdisjoint(NOISE):
         sensor = replace(sensor, **dict.fromkeys(NOISE, 0.0))

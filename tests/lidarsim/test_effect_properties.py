@@ -31,7 +31,7 @@ from lidarsim.scene import (
     Semantic,
     Shape,
 )
-from lidarsim.sensors.spinning import Lasers, hdl64e
+from lidarsim.sensors import Lasers, hdl64e
 from lidarsim.sweep import Echoes, Sweep
 
 # No effect warns, whatever the scene.

@@ -18,7 +18,7 @@ from lidarsim.effects import (
 )
 from lidarsim.raycast import cast
 from lidarsim.scene import EgoMotion, Material, Pose, Primitive, Scene, Semantic, Shape
-from lidarsim.sensors.spinning import hdl64e
+from lidarsim.sensors import hdl64e
 from lidarsim.solids import EGO_BODY, NO_SURFACE
 from lidarsim.sweep import Origin
 

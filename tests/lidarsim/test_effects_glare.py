@@ -13,7 +13,7 @@ from lidarsim.draws import Draws
 from lidarsim.effects import Blooming, DiffuseReflection, RetroReflection, SunGlare
 from lidarsim.scan import simulate_scan
 from lidarsim.scene import Conditions, Material, Pose, Scene, Semantic
-from lidarsim.sensors.spinning import hdl64e
+from lidarsim.sensors import hdl64e
 from lidarsim.sweep import Origin, Sweep
 
 SENSOR = hdl64e()

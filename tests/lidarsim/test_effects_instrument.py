@@ -17,7 +17,7 @@ from lidarsim.effects import (
 )
 from lidarsim.scan import simulate_scan
 from lidarsim.scene import Conditions, EgoMotion, Material, Scene, Semantic
-from lidarsim.sensors.spinning import hdl64e
+from lidarsim.sensors import hdl64e
 from lidarsim.street import Street
 from lidarsim.sweep import Origin, Sweep
 

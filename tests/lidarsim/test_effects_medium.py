@@ -11,7 +11,7 @@ from lidarsim.effects import DiffuseReflection, DualReturn, Fog, Rain, Snow, Spr
 from lidarsim.effects.medium import soft_waveform
 from lidarsim.scan import effect_name
 from lidarsim.scene import Conditions, Material, Scene, Semantic
-from lidarsim.sensors.spinning import Lasers, hdl64e
+from lidarsim.sensors import Lasers, hdl64e
 from lidarsim.solids import NO_SURFACE
 from lidarsim.sweep import Origin, Sweep
 

@@ -17,7 +17,7 @@ from lidarsim.effects import (
 )
 from lidarsim.scan import simulate_scan
 from lidarsim.scene import EgoMotion, Material, Pose, Primitive, Scene, Semantic, Shape
-from lidarsim.sensors.spinning import hdl64e
+from lidarsim.sensors import hdl64e
 from lidarsim.solids import EGO_BODY
 from lidarsim.sweep import Origin, Sweep
 

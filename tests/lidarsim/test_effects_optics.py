@@ -14,7 +14,7 @@ from lidarsim.effects import (
 )
 from lidarsim.effects.surface import fresnel_reflectance
 from lidarsim.scene import Conditions, Material, Pose, Puddle, Scene, Semantic
-from lidarsim.sensors.spinning import hdl64e
+from lidarsim.sensors import hdl64e
 from lidarsim.sweep import Origin
 
 SENSOR = hdl64e(shots=720)

@@ -8,7 +8,8 @@ from lidarsim import raycast
 from lidarsim.drive_files import velodyne_to_world
 from lidarsim.raycast import cast, cast_single, normals
 from lidarsim.scene import Conditions, EgoMotion, Pose, Primitive, Scene, Semantic, Shape
-from lidarsim.sensors.spinning import Rays, hdl64e
+from lidarsim.sensors import hdl64e
+from lidarsim.sensors.spinning import Rays
 from lidarsim.solids import GROUND, NO_SURFACE, Windows, level, solids_of
 
 REACH_M = 120.0

@@ -17,7 +17,7 @@ from lidarsim.scene import (
     Semantic,
     Shape,
 )
-from lidarsim.sensors.spinning import Lasers, hdl64e
+from lidarsim.sensors import Lasers, hdl64e
 from lidarsim.street import Street
 from lidarsim.sweep import Origin
 

@@ -16,7 +16,7 @@ from lidarsim.drive_files import drive_name, velodyne_to_world
 from lidarsim.drives import TRAIN_DRIVES, VAL_DRIVES, expected_scans, simulate, split_scans
 from lidarsim.scan import simulate_scan
 from lidarsim.scene import Conditions, Pose
-from lidarsim.sensors.spinning import hdl32e, hdl64e
+from lidarsim.sensors import hdl64e, load_sensor
 from lidarsim.street import Street
 from r3dpa.io import only_writer
 
@@ -142,7 +142,7 @@ def test_another_request_is_refused_with_both_values(tmp_path):
     for change, message in (
         ({"seed": 6}, r"\(seed 5 there, 6 now\)"),
         ({"sensor": hdl64e(40)}, r"\(sensor\.shots 32 there, 40 now\)"),
-        ({"sensor": hdl32e()}, r"sensor\.lasers\.inclination_rad 64 values there"),
+        ({"sensor": load_sensor("hdl32e")}, r"sensor\.lasers\.inclination_rad 64 values there"),
         ({"effects": {}}, r"\(effects\.range_noise 'off' there, None now\)"),
         ({"weather": Conditions()}, r"\(weather None there, {'visibility_m': None, "),
     ):

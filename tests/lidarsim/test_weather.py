@@ -20,7 +20,7 @@ from lidarsim.ground import ground_of
 from lidarsim.recorded import Instrument, RecordedScan, RecordedSweep, scale_of
 from lidarsim.scan import SECOND_RETURN_M, effect_name
 from lidarsim.scene import Conditions, Scene
-from lidarsim.sensors.spinning import hdl64e
+from lidarsim.sensors import hdl64e
 from lidarsim.weather import ADDED_CLASS, REFUSED, Weather
 
 CALLED = {
@@ -39,7 +39,7 @@ pytestmark = pytest.mark.filterwarnings("error")
 @pytest.fixture(scope="module")
 def scan():
     sensor = load_sensor("hdl64e", shots=520)
-    scene = Street(5, 0, Conditions()).scene(3, sensor.mount_height_m)
+    scene = Street(5, 0, Conditions()).scene(40, sensor.mount_height_m)
     found = simulate_scan(scene, sensor, ("recorded",))
     return RecordedScan(found.points[:, :3].copy(), found.points[:, 3].copy(), labels=found.labels)
 
@@ -198,7 +198,9 @@ def test_a_single_intensity_does_not_set_the_scale(scan, full, unit, factor):
     values[7] = factor * full
     odd = scale_of(values)
     assert unit in odd.text
-    assert odd.full == pytest.approx(plain.full, abs=0.0101 * full)  # a quantile moves by one step
+    assert odd.full == pytest.approx(
+        plain.full, abs=0.03 * full
+    )  # by three steps: few points are bright
 
 
 @pytest.mark.parametrize("kind", ["u1", "i4"])
