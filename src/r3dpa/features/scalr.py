@@ -183,7 +183,7 @@ class WaffleIronS(TokenFeatures):
     name = "waffleiron-s"
 
     def __init__(self, weights: Path | None = None, dim: int = 768) -> None:
-        state, network, grid = _read_weights(Path(weights) if weights else _SHIPPED)
+        state, network, grid = read_weights(Path(weights) if weights else _SHIPPED)
         super().__init__(network, grid)
         if dim < network.width:
             raise ValueError(f"dim must be at least {network.width}, got {dim}")
@@ -218,11 +218,13 @@ def save_weights(path: Path, network: WaffleIron, norm: nn.BatchNorm1d, grid: Sc
         save_file(state, temporary, metadata={_ABOUT: json.dumps(about)})
 
 
-def _read_weights(path: Path) -> tuple[dict[str, Tensor], WaffleIron, ScanGrid]:
+def read_weights(path: Path) -> tuple[dict[str, Tensor], WaffleIron, ScanGrid]:
+    """Float32 content of a file of :func:`save_weights`, with its network rebuilt, and its grid."""
     try:
         with safe_open(path, framework="pt") as file:
             about = json.loads(file.metadata()[_ABOUT])
-            state = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - no dict
+            stored = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - no dict
+        state = {key: v.float() if v.is_floating_point() else v for key, v in stored.items()}
         lists = about["grid"]
         settings: dict[str, Any] = {
             key: tuple(lists[key]) if isinstance(lists[key], list) else lists[key] for key in lists
