@@ -11,6 +11,7 @@ import wandb
 import yaml
 from lightning.pytorch.demos.boring_classes import BoringModel
 
+from lidarsim import simulate
 from r3dpa.cli import main
 from r3dpa.cli.features import with_data_class
 from r3dpa.cli.presets import conf_folder
@@ -207,11 +208,11 @@ def trained_teacher(smoke_root, run_dir, *more):
 
 
 def trained_with_classes(smoke_root, run_dir, *more):
+    simulate(smoke_root, scans=12)
     configs = ["trainer.yaml", "data/labelled_points.yaml", "experiment/waffleiron_s_2.yaml"]
     words = [f"--{key}={value}" for key, value in TEACHER.items()]
     words += [f"--data.init_args.source.init_args.scans={smoke_root}"]
-    drive = "data_3d_raw/2013_05_28_drive_0000_sync"
-    words += [f"--data.init_args.source.init_args.val_drives=[{drive}]"]
+    words += ["--data.init_args.source.init_args.val_drives=[2013_05_28_drive_0000_sync]"]
     return trained(configs, [*words, "--model.init_args.start=null"], run_dir, *more)
 
 
