@@ -19,14 +19,13 @@ from r3dpa.modules.point_pretraining import PointPretraining
 class PointSegmentation(PointPretraining):
     """WaffleIron trained to predict the class and the geometry of the points of masked scans.
 
-    The loss is ``class_weight`` times the cross-entropy of the classes, see :func:`class_loss`,
-    plus ``geometry_weight`` times that of :class:`PointPretraining`, both linear in the same token.
-    Scans without labels add to the second term alone.
+    The loss is the cross-entropy of the classes, see :func:`class_loss`, plus ``geometry_weight``
+    times the loss of :class:`PointPretraining`; both read the same tokens by a linear layer. Scans
+    without labels add to the second term alone.
 
     Args:
         network: Network to train; its ``cells`` are those of the scans' grid.
         start: Weights file of ``WaffleIronS`` to start from; its sizes are those of ``network``.
-        class_weight: Weight of the loss of the classes.
         geometry_weight: Weight of the loss of the masked geometry.
         lr: Peak learning rate; rises over ``warmup`` steps and falls to 0 as a cosine until
             ``max_steps`` of the trainer.
@@ -38,14 +37,13 @@ class PointSegmentation(PointPretraining):
         self,
         network: WaffleIron,
         start: Path | None = None,
-        class_weight: float = 1.0,
         geometry_weight: float = 1.0,
         lr: float = 2e-3,
         weight_decay: float = 0.03,
         warmup: int = 100,
     ) -> None:
         super().__init__(network, lr, weight_decay, warmup)
-        self.class_weight, self.geometry_weight = class_weight, geometry_weight
+        self.geometry_weight = geometry_weight
         self.class_head = nn.Linear(network.width, NUM_CLASSES)
         if start is not None:
             state, trained, _ = read_weights(start)
@@ -59,7 +57,7 @@ class PointSegmentation(PointPretraining):
         geometry = self.geometry_losses(tokens, scans)
         classes = torch.cat([_classes(masked) for masked in scans]).to(self.device)
         of_classes = class_loss(self.class_head(tokens), classes)
-        total = self.class_weight * of_classes + self.geometry_weight * geometry["loss"]
+        total = of_classes + self.geometry_weight * geometry["loss"]
         return geometry | {"loss": total, "classes": of_classes}
 
 
