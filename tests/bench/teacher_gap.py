@@ -117,7 +117,9 @@ def class_shares(scan, projection, grid_size):
     """Share of each class in each cell ``(N, 15)``, and how many points it has."""
     points = torch.from_numpy(read_scan(scan.path))
     classes = classes_of(torch.from_numpy(read_labels(scan.path, len(points)) & 0xFFFF))
-    return pool_cells(points[:, :3], F.one_hot(classes + 1)[:, 1:].float(), projection, grid_size)
+    return pool_cells(
+        points[:, :3], F.one_hot(classes + 1, NUM_CLASSES + 1)[:, 1:].float(), projection, grid_size
+    )
 
 
 def cached(folder, key, make):

@@ -181,7 +181,7 @@ class DrawnPoints(PointDataset):
 class LabelledPoints(DrawnPoints):
     """Masked scans with the classes of their points, all unknown in a scan without labels."""
 
-    def __getitem__(self, key: tuple[int, int] | int) -> MaskedScan:
+    def __getitem__(self, key: tuple[int, int] | int) -> Any:
         masked: MaskedScan = super().__getitem__(key)
         path = self.scans[key[1] if isinstance(key, tuple) else key].path
         labels = find_labels(path, len(masked.scan.upsample))
