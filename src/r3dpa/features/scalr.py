@@ -217,7 +217,7 @@ class WaffleIronS2(WaffleIronS):
 
     Args:
         weights: File written by that training. Default: the one that comes with the package.
-        dim: Width D of the features, at least that of the tokens (128 for those shipped).
+        dim: Width D of the features, at least the width of the tokens (128 in the shipped file).
     """
 
     name = "waffleiron-s-2"

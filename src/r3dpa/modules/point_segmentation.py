@@ -24,8 +24,8 @@ class PointSegmentation(PointPretraining):
     without labels add to the second term alone.
 
     Args:
-        network: Network to train; its ``cells`` are those of the scans' grid.
-        start: Weights file of ``WaffleIronS`` to start from; its sizes are those of ``network``.
+        network: Network to train, with the ``cells`` of the scans' grid.
+        start: Weights file of ``WaffleIronS`` to start from, of the same sizes as ``network``.
         geometry_weight: Weight of the loss of the masked geometry.
         lr: Peak learning rate; rises over ``warmup`` steps and falls to 0 as a cosine until
             ``max_steps`` of the trainer.
