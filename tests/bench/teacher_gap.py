@@ -1,4 +1,4 @@
-"""What a teacher could tell r3dpa-s: features that its tokens do not hold already, and their worth.
+"""What a teacher could add to r3dpa-s: features that its tokens do not hold yet, and their worth.
 
     python tests/bench/teacher_gap.py FIT TEST --extractors waffleiron-s weights.safetensors \
         --cache FOLDER --out gap.json
@@ -6,16 +6,16 @@
 FIT and TEST are folders of labelled scans of different drives (``r3dpa data simulate``).
 
 - Gap: one minus the explained variance, on TEST, of a ridge regression from the tokens of one
-  block of an unaligned SiT to a target in each cell of its grid, at several flow times. Targets are
-  standardised: the share of each class among the points of a cell (what a perfect teacher of
-  classes tells), and mean point features of extractors. RARE (2026) finds that the benefit of
-  alignment grows with it.
+  block of an unaligned SiT to a target in each cell of its grid, averaged over flow times and, with
+  equal weights, over the components of the target: the shares of the classes among the points of
+  a cell (what a perfect teacher of classes knows), or mean point features of an extractor. RARE
+  (2026) finds that the benefit of alignment grows with it.
 - Classes: explained variance of the class shares from the features of the cell instead.
 - Probe: mean IoU over the classes of TEST of a linear classifier of single points.
 
 Latents, features and class shares are kept in the cache, by the hash of the extractor's weights.
 Extractors are names of ``r3dpa.features.SOURCES`` or weights files of ``WaffleIronS``.
-About 1.5 s per scan on one core for the first extractor and 0.6 s for each further one.
+About 1 s per scan and extractor on one core.
 """
 
 from __future__ import annotations
@@ -86,6 +86,7 @@ def fit_probe(features, classes):
     """Linear classifier of points, by logistic regression."""
     probe = nn.Linear(features.shape[1], NUM_CLASSES)
     nn.init.zeros_(probe.weight)
+    nn.init.zeros_(probe.bias)
     features = features * features.shape[1] ** 0.5  # of unit norm
     optimizer = torch.optim.LBFGS(
         probe.parameters(), max_iter=PROBE_STEPS, line_search_fn="strong_wolfe"
