@@ -11,6 +11,7 @@ import wandb
 import yaml
 from lightning.pytorch.demos.boring_classes import BoringModel
 
+from lidarsim import simulate
 from r3dpa.cli import main
 from r3dpa.cli.features import with_data_class
 from r3dpa.cli.presets import conf_folder
@@ -173,9 +174,11 @@ def test_evaluation_joins_the_wandb_run_of_the_training(tmp_path):
     assert all(f"-{run_id}" in name for name in folders)
 
 
-TEACHER = {
+SIMULATED = {
     "data.init_args.source.init_args.num_scans": 12,
     "data.init_args.source.init_args.simulation_seed": 0,
+}
+TEACHER = {
     "data.init_args.source.init_args.limit": 3,
     "data.init_args.batch_size": 1,
     "data.init_args.num_workers": 0,
@@ -199,17 +202,32 @@ TEACHER = {
 
 def trained_teacher(smoke_root, run_dir, *more):
     configs = ["trainer.yaml", "data/points.yaml", "experiment/waffleiron_s.yaml"]
+    words = [f"--{key}={value}" for key, value in (TEACHER | SIMULATED).items()]
+    words += [f"--data.init_args.source.init_args.root={smoke_root}"]
+    return trained(configs, words, run_dir, *more)
+
+
+def trained_with_classes(smoke_root, run_dir, *more):
+    simulate(smoke_root, scans=12)
+    configs = ["trainer.yaml", "data/labelled_points.yaml", "experiment/waffleiron_s_2.yaml"]
+    words = [f"--{key}={value}" for key, value in TEACHER.items()]
+    words += [f"--data.init_args.source.init_args.scans={smoke_root}"]
+    words += ["--data.init_args.source.init_args.val_drives=[2013_05_28_drive_0000_sync]"]
+    return trained(configs, [*words, "--model.init_args.start=null"], run_dir, *more)
+
+
+def trained(configs, settings, run_dir, *more):
     words = [word for name in configs for word in ("--config", str(CONF / name))]
-    words += [f"--{key}={value}" for key, value in TEACHER.items()]
-    words += [f"--data.init_args.source.init_args.root={smoke_root}", f"--run_dir={run_dir}"]
+    words += [*settings, f"--run_dir={run_dir}"]
     main(["fit", *words, *more])
     return torch.load(run_dir / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
 
 
-def test_the_point_teacher_trains_resumes_exactly_and_gives_a_source(smoke_root, tmp_path):
-    whole = trained_teacher(smoke_root, tmp_path / "whole")
+@pytest.mark.parametrize("train", [trained_teacher, trained_with_classes])
+def test_the_point_teacher_trains_resumes_exactly_and_gives_a_source(train, smoke_root, tmp_path):
+    whole = train(smoke_root, tmp_path / "whole")
     middle = tmp_path / "whole" / "checkpoints" / "step=0000001.ckpt"
-    resumed = trained_teacher(smoke_root, tmp_path / "rest", f"--ckpt_path={middle}")
+    resumed = train(smoke_root, tmp_path / "rest", f"--ckpt_path={middle}")
     for key, value in whole.items():
         assert torch.equal(resumed[key], value), key
     weights = tmp_path / "rest" / "waffleiron_s.safetensors"

@@ -28,6 +28,7 @@ from r3dpa.data.store import StoreError
 _ON_FIRST_USE = {
     "ImageDataModule": "image_datamodule",
     "KITTI360DataModule": "datamodules",
+    "LabelledPointDataModule": "datamodules",
     "LidarDataModule": "datamodules",
     "PointDataModule": "datamodules",
     "SimulatedDataModule": "datamodules",
@@ -42,6 +43,7 @@ __all__ = [
     "ImageDataModule",
     "ImageFolder",
     "KITTI360DataModule",
+    "LabelledPointDataModule",
     "LidarBatch",
     "LidarDataModule",
     "LidarDataset",

@@ -20,7 +20,7 @@ from lidarsim.scan_files import read_scan
 from lidarsim.scene import Conditions
 from lidarsim.weather import WeatherPrior
 from r3dpa.data.augmentation import Augmentation, AugmentedDataset
-from r3dpa.data.datasets import CachedImages, DrawnPoints, LidarDataset
+from r3dpa.data.datasets import CachedImages, DrawnPoints, LabelledPoints, LidarDataset
 from r3dpa.data.feature_grids import Extractor, FeatureGrids, any_settings, write_feature_grids
 from r3dpa.data.loader_module import LoaderModule
 from r3dpa.data.loaders import at_least
@@ -443,3 +443,35 @@ class PointDataModule(LoaderModule):
     def val_dataloader(self) -> DataLoader[Any]:
         """Held-out scans in order, none twice, each drawn the same every time."""
         return self.loader(self.val_set, train=False, collate_fn=list)
+
+
+class LabelledPointDataModule(PointDataModule):
+    """Points of the scans of another data module, masked, with the classes of those that have any.
+
+    Weather would move points away from their labels, so there is none.
+
+    Args:
+        source: Scans and their split, with or without label files, see
+            :func:`r3dpa.data.labels.read_labels`. Give it ``extractor: null``.
+        prepare: An ``r3dpa.features.Masking``.
+        batch_size: Scans per batch and process.
+        num_workers: Loader processes per training process.
+        seed: Seed of order and draws.
+    """
+
+    def __init__(
+        self,
+        source: LidarDataModule,
+        prepare: Callable[..., Any],
+        batch_size: int = 2,
+        num_workers: int = 0,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(source, prepare, batch_size, num_workers, seed)
+
+    def setup(self, stage: str) -> None:
+        """Index the scans."""
+        self.train_set, self.val_set = (
+            LabelledPoints(scans, self.source.sensor, self.prepare, self.seed)
+            for scans in self.source.limited_split()
+        )

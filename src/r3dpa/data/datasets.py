@@ -14,9 +14,10 @@ from torch.utils.data import Dataset
 
 from lidarsim.scan_files import ScanError, out_of_range, read_scan
 from lidarsim.weather import WeatherPrior
-from r3dpa.data.labels import read_labels
+from r3dpa.data.labels import find_labels, read_labels
 from r3dpa.data.scans import Scan
 from r3dpa.data.store import CachedTensors, ItemKey
+from r3dpa.features.voxels import MaskedScan
 from r3dpa.geometry import (
     LidarSensor,
     Pixels,
@@ -26,6 +27,7 @@ from r3dpa.geometry import (
     project_pixels,
     range_image,
 )
+from r3dpa.geometry.semantics import UNKNOWN_CLASS, classes_of
 
 #: Function of the points ``(P, 4)`` of a scan.
 Change = Callable[[np.ndarray], np.ndarray]
@@ -174,6 +176,21 @@ class DrawnPoints(PointDataset):
                 raise _lost_in_weather(self.scans[index].path, self.sensor)
         points = torch.from_numpy(read)
         return self.prepare(points, np.random.default_rng((self.seed, epoch, index)))
+
+
+class LabelledPoints(DrawnPoints):
+    """Masked scans with the classes of their points, all unknown in a scan without labels."""
+
+    def __getitem__(self, key: tuple[int, int] | int) -> Any:
+        masked: MaskedScan = super().__getitem__(key)
+        path = self.scans[key[1] if isinstance(key, tuple) else key].path
+        labels = find_labels(path, len(masked.scan.upsample))
+        if labels is None:
+            unknown = torch.full((len(masked.hidden),), UNKNOWN_CLASS)
+            return masked._replace(classes=unknown)
+        # The upper bits of a label are the object.
+        kept = torch.from_numpy(labels & 0xFFFF)[masked.scan.kept]
+        return masked._replace(classes=classes_of(kept))
 
 
 def _lost_in_weather(path: Path, sensor: LidarSensor) -> ScanError:

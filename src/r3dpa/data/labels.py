@@ -97,6 +97,18 @@ def read_labels(scan: str | Path, num_points: int) -> NDArray[np.int64]:
         ``(P,)`` KITTI-360 class in the lower 16 bits, see :data:`CLASS_NAMES`, 0 without a label;
         number of the object in the upper, 0 for none.
     """
+    labels = find_labels(scan, num_points)
+    if labels is None:
+        raise ScanError(
+            f"{scan} has no labels: looked for labels/{Path(scan).stem}.label beside its folder, "
+            "velodyne_points/data as KITTI-360 and `r3dpa data simulate` have it, or velodyne as "
+            "SemanticKITTI"
+        )
+    return labels
+
+
+def find_labels(scan: str | Path, num_points: int) -> NDArray[np.int64] | None:
+    """Labels ``(P,)`` as of :func:`read_labels`; None for a scan without a label file."""
     scan = Path(scan)
     simulated = read_beside(scan, "labels")
     if simulated is not None:
@@ -104,11 +116,7 @@ def read_labels(scan: str | Path, num_points: int) -> NDArray[np.int64]:
     path = scan.absolute().parents[1] / "labels" / f"{scan.stem}.label"
     if scan.parent.name == "velodyne" and path.exists():
         return _semantic_kitti(path, num_points)
-    raise ScanError(
-        f"{scan} has no labels: looked for labels/{scan.stem}.label beside its folder, "
-        "velodyne_points/data as KITTI-360 and `r3dpa data simulate` have it, or velodyne as "
-        "SemanticKITTI"
-    )
+    return None
 
 
 def write_labels(path: str | Path, labels: Tensor) -> None:

@@ -36,7 +36,7 @@ from r3dpa.features.waffleiron import WaffleIron
 from r3dpa.io import UNPICKLING_ERRORS, atomic_path, first_line, weights_sha256
 
 #: Names that :func:`feature_source` accepts.
-SOURCES = ("scalr", "waffleiron-s", "geometric")
+SOURCES = ("scalr", "waffleiron-s", "waffleiron-s-2", "geometric")
 
 _RELEASED = "ckpt_last.pth of WI_768-DINOv2_ViT_L_14-NS_KI_PD"
 # Entries with the weights in files of the distillation script and of its successor.
@@ -57,7 +57,7 @@ _OFFICIAL_NAMES = {
     r"head": "classif",
 }
 _CPU_POINTS = 16384  # in one pass
-_SHIPPED = Path(str(files("r3dpa.features"))) / "waffleiron_s.safetensors"
+_FOLDER = Path(str(files("r3dpa.features")))
 _ABOUT = "waffleiron"  # metadata key of that file: sizes of the network, grid
 
 
@@ -181,9 +181,10 @@ class WaffleIronS(TokenFeatures):
     basis: Tensor
 
     name = "waffleiron-s"
+    shipped = _FOLDER / "waffleiron_s.safetensors"
 
     def __init__(self, weights: Path | None = None, dim: int = 768) -> None:
-        state, network, grid = _read_weights(Path(weights) if weights else _SHIPPED)
+        state, network, grid = read_weights(Path(weights) if weights else self.shipped)
         super().__init__(network, grid)
         if dim < network.width:
             raise ValueError(f"dim must be at least {network.width}, got {dim}")
@@ -208,6 +209,21 @@ class WaffleIronS(TokenFeatures):
         return values @ self.basis.T
 
 
+class WaffleIronS2(WaffleIronS):
+    """``waffleiron-s-2``: its second edition, also trained on the classes of simulated points.
+
+    Training and evaluation are described in ``README.md`` beside the weights; see
+    :class:`r3dpa.modules.PointSegmentation`.
+
+    Args:
+        weights: File written by that training. Default: the one that comes with the package.
+        dim: Width D of the features, at least the width of the tokens (128 in the shipped file).
+    """
+
+    name = "waffleiron-s-2"
+    shipped = _FOLDER / "waffleiron_s_2.safetensors"
+
+
 def save_weights(path: Path, network: WaffleIron, norm: nn.BatchNorm1d, grid: ScanGrid) -> None:
     """Write what :class:`WaffleIronS` reads; ``norm`` has the statistics of the tokens."""
     state = {f"network.{key}": value for key, value in network.state_dict().items()}
@@ -218,11 +234,13 @@ def save_weights(path: Path, network: WaffleIron, norm: nn.BatchNorm1d, grid: Sc
         save_file(state, temporary, metadata={_ABOUT: json.dumps(about)})
 
 
-def _read_weights(path: Path) -> tuple[dict[str, Tensor], WaffleIron, ScanGrid]:
+def read_weights(path: Path) -> tuple[dict[str, Tensor], WaffleIron, ScanGrid]:
+    """Float32 content of a file of :func:`save_weights`, with its network rebuilt, and its grid."""
     try:
         with safe_open(path, framework="pt") as file:
             about = json.loads(file.metadata()[_ABOUT])
-            state = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - no dict
+            stored = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - no dict
+        state = {key: v.float() if v.is_floating_point() else v for key, v in stored.items()}
         lists = about["grid"]
         settings: dict[str, Any] = {
             key: tuple(lists[key]) if isinstance(lists[key], list) else lists[key] for key in lists
@@ -245,9 +263,10 @@ def feature_source(name: str, ckpt: str | Path | None = None, dim: int = 768) ->
 
     Args:
         name: ``"scalr"``: distilled from images, needs the released checkpoint;
-            ``"waffleiron-s"``: trained on simulated scans without labels; ``"geometric"``: local
-            shape, without training.
-        ckpt: Weights of ``"scalr"`` or ``"waffleiron-s"``; the latter has default weights.
+            ``"waffleiron-s"``: trained on simulated scans without labels; ``"waffleiron-s-2"``:
+            with labels; ``"geometric"``: local shape, without training.
+        ckpt: Weights of ``"scalr"``, or of ``"waffleiron-s"`` and ``"waffleiron-s-2"``, which have
+            default weights.
         dim: Width D of the features; for ``"scalr"``, the width of its checkpoint.
     """
     if name not in SOURCES:
@@ -262,8 +281,9 @@ def feature_source(name: str, ckpt: str | Path | None = None, dim: int = 768) ->
         if scalr.dim != dim:
             raise ValueError(f"{ckpt} has features of width {scalr.dim}, but dim is {dim}")
         return scalr
-    if name == "waffleiron-s":
-        return WaffleIronS(None if ckpt is None else Path(ckpt), dim=dim)
+    for edition in (WaffleIronS, WaffleIronS2):
+        if name == edition.name:
+            return edition(None if ckpt is None else Path(ckpt), dim=dim)
     if ckpt is not None:
         raise ValueError(f"feature source {name} has no weights: leave ckpt ({ckpt}) out")
     return GeometricFeatures(dim)

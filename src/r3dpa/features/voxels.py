@@ -185,6 +185,7 @@ class MaskedScan(NamedTuple):
     scan: PreparedScan
     hidden: Tensor  #: ``(M,)`` bool: kept points that the network must not see
     targets: Tensor  #: ``(M, T)`` float32 descriptors of the kept points within the whole scan
+    classes: Tensor | None = None  #: ``(M,)`` int64 semantic classes, -1 where unknown
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from r3dpa.modules.flow_matching import FlowMatching
 from r3dpa.modules.image_vae import ImageVAETraining
 from r3dpa.modules.joint_alignment import JointAlignment
 from r3dpa.modules.point_pretraining import PointPretraining
+from r3dpa.modules.point_segmentation import PointSegmentation
 from r3dpa.modules.rgb_pretraining import RGBPretraining
 from r3dpa.modules.settings import LossWeights, OptimizerConfig
 from r3dpa.modules.vae_alignment import VAEAlignment
@@ -21,6 +22,7 @@ __all__ = [
     "LossWeights",
     "OptimizerConfig",
     "PointPretraining",
+    "PointSegmentation",
     "RGBPretraining",
     "VAEAlignment",
 ]

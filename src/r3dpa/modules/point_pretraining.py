@@ -99,11 +99,19 @@ class PointPretraining(LightningModule):
 
     def losses(self, scans: Sequence[MaskedScan]) -> dict[str, Tensor]:
         """Mean cross-entropy of all points, of the visible and of the hidden ones (0 if none)."""
+        return self.geometry_losses(self.tokens_of(scans), scans)
+
+    def tokens_of(self, scans: Sequence[MaskedScan]) -> Tensor:
+        """Standardised tokens ``(N, F)`` of all points of masked scans."""
         batch = collate_scans([masked.scan for masked in scans]).to(self.device)
+        return self.tokens(batch, torch.cat([masked.hidden for masked in scans]).to(self.device))
+
+    def geometry_losses(self, tokens: Tensor, scans: Sequence[MaskedScan]) -> dict[str, Tensor]:
+        """The same from their tokens ``(N, F)``."""
         hidden = torch.cat([masked.hidden for masked in scans]).to(self.device)
         targets = torch.cat([masked.targets for masked in scans]).to(self.device)
         bins = torch.searchsorted(self.edges, targets.T.contiguous()).T
-        logits = self.head(self.tokens(batch, hidden)).unflatten(1, (NUM_TARGETS, -1))
+        logits = self.head(tokens).unflatten(1, (NUM_TARGETS, -1))
         each = F.cross_entropy(logits.flatten(0, 1), bins.flatten(), reduction="none")
         each = each.unflatten(0, bins.shape).mean(dim=1)
         return {
