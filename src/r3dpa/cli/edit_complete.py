@@ -284,9 +284,10 @@ def _summary(num_scans: int, nfe: int, errors: dict[str, Any], out: Path) -> str
             f"mean error of the held-out returns: completed {completed:.2f} m, linear "
             f"interpolation {linear:.2f} m, nearest beam or column {nearest:.2f} m"
         )
+    scans = "1 scan" if num_scans == 1 else f"{num_scans} scans"
     return (
-        f"complete: {num_scans} scans in {out / _SCANS}, {nfe} network evaluations each; all their "
-        f"points, then the generated ones\n{text}\n"
+        f"complete: {scans} in {out / _SCANS}, {nfe} network evaluations each; all points of the "
+        f"input, then the generated ones\n{text}\n"
         f"open {out / 'edit.png'} and {out / 'edit.html'}"
     )
 
