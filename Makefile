@@ -170,7 +170,7 @@ bench-gpu: $(READY) ## on a GPU: training steps at full size, and sampling from 
 	$(if $(CKPT),$(BIN)/r3dpa bench sampling --device cuda --ckpt $(CKPT) --out runs/bench_gpu/sampling)
 
 docs: $(READY) ## API pages in build/docs
-	$(BIN)/python docs/api.py build/docs
+	$(BIN)/python tests/write_api_pages.py build/docs
 
 clean: ## remove caches and runs, keep .venv
 	rm -rf runs build .pytest_cache .mypy_cache .ruff_cache

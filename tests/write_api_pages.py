@@ -1,13 +1,10 @@
-"""Write API pages of both packages into a folder: ``python docs/api.py build/docs``."""
+"""Write API pages of both packages into a folder: ``python tests/write_api_pages.py build/docs``."""
 
 import importlib
 import pkgutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-
-import pdoc
-import pdoc.render
 
 
 def module_names(package: str) -> Iterator[str]:
@@ -21,6 +18,15 @@ def module_names(package: str) -> Iterator[str]:
             yield found.name
 
 
-pdoc.render.configure(docformat="google")
-names = [name for package in ("lidarsim", "r3dpa") for name in module_names(package)]
-pdoc.pdoc(*names, output_directory=Path(sys.argv[1]))
+def main() -> None:
+    """Write the pages into the folder of the command line."""
+    import pdoc
+    import pdoc.render
+
+    pdoc.render.configure(docformat="google")
+    names = [name for package in ("lidarsim", "r3dpa") for name in module_names(package)]
+    pdoc.pdoc(*names, output_directory=Path(sys.argv[1]))
+
+
+if __name__ == "__main__":
+    main()
