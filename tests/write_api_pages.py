@@ -1,4 +1,4 @@
-"""Write API pages of both packages into a folder: ``python tests/write_api_pages.py build/docs``."""
+"""API pages of both packages: ``python tests/write_api_pages.py build/docs``."""
 
 import importlib
 import pkgutil
