@@ -1,4 +1,4 @@
-"""What a scan is: format, columns, beams and frame in words."""
+"""Describe a scan in words: format, columns, beams and frame."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ def scalr_file(tmp_path):
 
 
 def test_each_name_gives_its_extractor(scalr_file):
-    assert SOURCES == ("scalr", "waffleiron-s", "waffleiron-s-2", "geometric")
+    assert SOURCES == ("scalr", "waffleiron-s", "geometric")
     for name, ckpt, kind in (("scalr", scalr_file, ScaLR), ("geometric", None, GeometricFeatures)):
         source = feature_source(name, ckpt, dim=4)
         assert type(source) is kind
@@ -24,20 +24,10 @@ def test_each_name_gives_its_extractor(scalr_file):
     assert feature_source("scalr", str(scalr_file), 4).settings["weights"]
 
 
-def test_both_editions_are_at_hand_and_differ():
-    """Edition 2 is stored as float16; networks compute in float32."""
-    points = torch.rand(200, 4, generator=torch.Generator().manual_seed(0)) * 10
-    first, second = (feature_source(name, dim=128) for name in ("waffleiron-s", "waffleiron-s-2"))
-    assert (first.name, second.name) == ("waffleiron-s", "waffleiron-s-2")
-    assert second(points).dtype == torch.float32
-    assert (first(points) - second(points)).abs().max() > 0.01
-    assert first.settings != second.settings
-
-
 def test_refused_names_and_checkpoints(scalr_file):
     with pytest.raises(ValueError, match="source 'dino'; choose from scalr, waffleiron-s"):
         feature_source("dino")
-    with pytest.raises(ValueError, match=r"scalr needs ckpt.*choose from waffleiron-s, waff"):
+    with pytest.raises(ValueError, match=r"scalr needs ckpt.*choose from waffleiron-s, geometric"):
         feature_source("scalr")
     with pytest.raises(ValueError, match=r"ckpt_last.pth has features of width 4, but dim is 768"):
         feature_source("scalr", scalr_file)

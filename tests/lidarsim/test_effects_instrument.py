@@ -87,13 +87,13 @@ def test_limits_of_power_and_range():
     assert kept[8:].all()
 
 
-@pytest.mark.parametrize(("material", "factor"), [("ASPHALT", 1), ("BRICK", 1.2), ("FOLIAGE", 10)])
+@pytest.mark.parametrize(("material", "factor"), [("ASPHALT", 1), ("BRICK", 3), ("FOLIAGE", 10)])
 def test_share_of_lost_shots_by_material(material, factor):
     """A start with probability s loses 1 + g + g^2 + g^3 + g^4 shots; overlaps are of order s^2."""
     start, goes_on = 0.002, 0.25
     sweep = swept(replace(SENSOR, lost_share=start), power=1.0)
     sweep.material[:] = Material[material]
-    applied(sweep, LostShots(goes_on=goes_on))
+    applied(sweep, LostShots(upright=3.0, rough=10.0, goes_on=goes_on))
     lost = np.isinf(sweep.first.range_m)
     expected = 1 - np.prod([1 - factor * start * goes_on**k for k in range(5)])
     # Shots of one run are lost together: the variance is up to 1 + 2 g / (1 - g) times larger.

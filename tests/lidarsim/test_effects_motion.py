@@ -19,6 +19,7 @@ from lidarsim.scan import simulate_scan
 from lidarsim.scene import EgoMotion, Material, Pose, Primitive, Scene, Semantic, Shape
 from lidarsim.sensors import hdl64e
 from lidarsim.solids import EGO_BODY
+from lidarsim.street.vehicles import recording_car
 from lidarsim.sweep import Origin, Sweep
 
 SENSOR = replace(hdl64e(), range_sigma_m=0.0, weak_range_sigma_m=0.0, range_step_m=0.0)
@@ -169,3 +170,13 @@ def test_the_recording_car_hides_the_same_rays_in_every_scene():
     expected = hidden[np.arange(64), left]
     assert (steep == expected).mean() > 0.96  # the lateral offset moves a beam or two
     assert steep.any()
+
+
+def test_share_of_shots_that_the_recording_car_hides():
+    """In all of 24 scans of KITTI 6.4 % of the shots are lost, of beams 42 to 64."""
+    sensor = hdl64e()
+    scene = Scene(room(), ego_body=recording_car())
+    hidden = np.zeros(sensor.rays.direction.shape[1:], dtype=bool)
+    hidden.reshape(-1)[EgoOcclusion().rays(Sweep(scene, sensor))] = True
+    assert hidden.mean() == pytest.approx(0.064, abs=0.004)
+    assert not hidden[:41].any()

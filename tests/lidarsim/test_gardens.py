@@ -8,7 +8,7 @@ from sweeps import inside
 from lidarsim.raycast import cast
 from lidarsim.scene import Material, Pose, Semantic
 from lidarsim.solids import NO_SURFACE, solids_of
-from lidarsim.street.builder import Builder
+from lidarsim.street.builder import Builder, Strip
 from lidarsim.street.course import BLOCK_M, course_of
 from lidarsim.street.gardens import (
     border,
@@ -42,7 +42,7 @@ OBJECTS = {
     "street_tree": (street_tree, (START_M + 9, 8.0), GREEN),
     "garden_tree": (garden_tree, (START_M + 9, 14.0), GREEN),
     "wood_edge": (wood_edge, (START_M + 12, -25.0), GREEN),
-    "verge": (verge, (-1.0, START_M, START_M + 20, 9.0, 11.0), GREEN | {Semantic.TERRAIN}),
+    "verge": (verge, (Strip(-1.0, START_M, START_M + 20, 9.0, 11.0),), GREEN | {Semantic.TERRAIN}),
     "meadow": (meadow, (-1.0, 9.0), {Semantic.TERRAIN}),
 }
 
@@ -145,7 +145,7 @@ def test_a_front_garden_lies_between_pavement_and_house_and_keeps_its_path_clear
     for seed in range(40):
         builder = Builder(COURSE, SECTION, 1)
         draw = np.random.default_rng(seed)
-        front_garden(builder, draw, 1.0, START_M + 2, START_M + 20, 10.0, 15.0)
+        front_garden(builder, draw, Strip(1.0, START_M + 2, START_M + 20, 10.0, 15.0))
         (path,) = (p for p in builder.primitives if p.semantic == Semantic.SIDEWALK)
         path_s = in_street(path)[0]
         assert path.half_size[1] == pytest.approx(2.5)

@@ -266,3 +266,16 @@ def test_negative_numbers_are_refused():
         Street(-1, 0)
     with pytest.raises(ValueError, match="scan must be 0 or greater, got -1"):
         Street(0, 0).scene(-1)
+
+
+def test_a_pavement_lies_a_kerb_above_the_gutter_and_a_verge_begins_level_with_it():
+    steps = {True: [], False: []}
+    for drive in range(40):
+        course = course_of(0, drive)
+        for side in (-1.0, 1.0):
+            kerb = course.kerb(side)
+            inside, outside = (course.surface_m(side * (kerb.edge_m + x)) for x in (-1e-6, 1e-6))
+            steps[kerb.pavement_m > 0].append((outside - inside) / course.kerb_m)
+    np.testing.assert_allclose(steps[True], 1.0, atol=1e-3)
+    np.testing.assert_allclose(steps[False], 0.0, atol=1e-3)
+    assert min(map(len, steps.values())) > 3

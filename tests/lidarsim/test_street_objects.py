@@ -5,7 +5,7 @@ import pytest
 
 from lidarsim import Material, Semantic, Shape
 from lidarsim.street import furniture, people, vehicles, works
-from lidarsim.street.builder import Builder
+from lidarsim.street.builder import Builder, Strip
 from lidarsim.street.course import BLOCK_M, Kerb, course_of
 
 # A street without bends and slopes, whose sides are pavements: x is s, y the lateral distance.
@@ -97,7 +97,7 @@ BUILDS |= {
     "bicycles": placed(furniture.bicycles),
     "clutter": placed(furniture.clutter),
     "building_site": lambda builder, draw: works.building_site(
-        builder, draw, -1.0, S - 10, S + 10, 6.0, 14.0
+        builder, draw, Strip(-1.0, S - 10, S + 10, 6.0, 14.0)
     ),
     "parked_vehicle": stood(vehicles.parked_vehicle),
 }

@@ -104,8 +104,8 @@ class LostShots(Effect):
     the factor of the material, and goes on to each next shot with the probability ``goes_on``.
 
     Source: between two returns of one smooth surface at 4 to 24 m, KITTI's HDL-64E loses 0.1 to
-    0.4 % of the shots at the ground, 0.5 to 1.4 % at walls and 2 to 3 % at all surfaces together
-    (30 scans of four drives), at strong echoes as well as at weak ones.
+    0.4 % of the shots at the ground, 0.5 to 1.4 % at upright surfaces and 0.8 to 2.6 % at all
+    surfaces together (30 scans of four drives), at strong echoes as well as at weak ones.
 
     Args:
         upright: Factor of all materials except ground materials.

@@ -91,7 +91,7 @@ class SensorEstimate:
         write_sensor(path, SensorFile(name or Path(path).stem, source, self.sensor), self.to_dict())
 
     def to_dict(self) -> dict[str, Any]:
-        """What the fields of the sensor do not hold, for files."""
+        """Return mount, confidences and other findings beside the sensor, as plain values."""
         mount = None
         if self.mount is not None:
             mount = {name: round(value, 4) for name, value in self.mount._asdict().items()}

@@ -1,4 +1,4 @@
-"""What a range image shows of a spinning LiDAR, and ranges and angles of points."""
+"""Field of view and limits of a range image; ranges and angles of points."""
 
 from __future__ import annotations
 

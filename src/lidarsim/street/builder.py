@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from numpy.random import Generator
 
@@ -18,6 +19,20 @@ Place = tuple[float, float]
 
 _TERRAIN_M = 48.0
 _SLAB_M = 1.0
+
+
+class Strip(NamedTuple):
+    """A piece of land along the street.
+
+    ``side``: 1 left of the axis, -1 right. ``first``, ``last``: values of s between which it lies,
+    ``near_m``, ``far_m``: distances from the axis.
+    """
+
+    side: float
+    first: float
+    last: float
+    near_m: float
+    far_m: float
 
 
 class Builder:

@@ -10,7 +10,7 @@ import math
 from numpy.random import Generator
 
 from lidarsim.scene import Interval, Material, Semantic, Shape
-from lidarsim.street.builder import FOOTING_M, Builder
+from lidarsim.street.builder import FOOTING_M, Builder, Strip
 from lidarsim.street.course import BLOCK_M
 from lidarsim.street.trees import LEAVES, clump, garden_tree, grass, tuft
 
@@ -343,20 +343,12 @@ def _plant(builder: Builder, draw: Generator, s: float, lateral: float, room_m: 
         _furniture(builder, draw, s, lateral)
 
 
-def front_garden(
-    builder: Builder,
-    draw: Generator,
-    side: float,
-    first: float,
-    last: float,
-    near_m: float,
-    far_m: float,
-) -> None:
+def front_garden(builder: Builder, draw: Generator, strip: Strip) -> None:
     """Plants, a path and sometimes furniture between the pavement and the front of a house.
 
-    ``near_m`` and ``far_m``: distances of both from the axis; ``first`` and ``last``: the values
-    of s between which the garden lies. The path to the door keeps clear of plants.
+    The path to the door keeps clear of plants.
     """
+    side, first, last, near_m, far_m = strip
     room_m = far_m - near_m
     path_s, half_m = draw.uniform(0.2, 0.8) * (last - first) + first, draw.uniform(0.5, 0.8)
     start = builder.section.block * BLOCK_M
@@ -373,16 +365,9 @@ def front_garden(
             _plant(builder, draw, s, at, room_m)
 
 
-def verge(
-    builder: Builder,
-    draw: Generator,
-    side: float,
-    first: float,
-    last: float,
-    near_m: float,
-    far_m: float,
-) -> None:
-    """Tall grass with tufts and single tall weeds between two distances from the axis."""
+def verge(builder: Builder, draw: Generator, strip: Strip) -> None:
+    """Tall grass with tufts and single tall weeds."""
+    side, first, last, near_m, far_m = strip
     deep_m = draw.uniform(0.05, 0.14)
     across = (side * near_m, side * far_m)
     grass(builder, (first, last), across, deep_m, draw.uniform(1.2, 3.0))

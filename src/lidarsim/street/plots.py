@@ -11,7 +11,7 @@ import math
 from numpy.random import Generator
 
 from lidarsim.scene import Material, Semantic
-from lidarsim.street.builder import Builder
+from lidarsim.street.builder import Builder, Strip
 from lidarsim.street.buildings import (
     building,
     carport,
@@ -63,7 +63,7 @@ def _town(builder: Builder, draw: Generator, start: float, side: float, edge_m: 
             front_m = edge_m + draw.uniform(2.0, 4.5)
             building(builder, draw, (s, last), front_m, side, draw.uniform(8, 12), 10.0)
             border(builder, draw, side * (edge_m + 0.4), s, last)
-            front_garden(builder, draw, side, s, last, edge_m + 0.8, front_m)
+            front_garden(builder, draw, Strip(side, s, last, edge_m + 0.8, front_m))
         else:
             _passage(builder, draw, s, last, side, edge_m)
         s = last
@@ -96,7 +96,7 @@ def _row_houses(
     for first, last in ((start, start + 8), (start + 8, start + 16), (start + 16, end)):
         if draw.random() < 0.75:
             border(builder, draw, side * (edge_m + 0.4), first, last - 1.3)
-        front_garden(builder, draw, side, first, last, edge_m + 0.8, edge_m + setback_m)
+        front_garden(builder, draw, Strip(side, first, last, edge_m + 0.8, edge_m + setback_m))
         if draw.random() < 0.5:
             bins(builder, draw, last - 1.2, side * (edge_m + draw.uniform(0.5, setback_m - 1)))
     for _ in range(int(draw.poisson(_FRONT_TREES))):
@@ -118,7 +118,7 @@ def _houses(builder: Builder, draw: Generator, start: float, side: float, edge_m
     building(builder, draw, (first, first + wide_m), front_m, side, *size)
     if draw.random() < 0.9:
         border(builder, draw, side * (edge_m + 0.4), plot, plot_end)
-    front_garden(builder, draw, side, plot, plot_end, edge_m + 0.9, front_m)
+    front_garden(builder, draw, Strip(side, plot, plot_end, edge_m + 0.9, front_m))
     for _ in range(int(draw.poisson(_FRONT_TREES))):
         at = side * (edge_m + draw.uniform(1.5, max(1.6, setback_m - 1.0)))
         garden_tree(builder, draw, draw.uniform(plot + 1, plot_end - 1), at)
@@ -169,7 +169,7 @@ def _blocks(builder: Builder, draw: Generator, start: float, side: float, edge_m
     end, setback_m = start + BLOCK_M, draw.uniform(5.0, 9.0)
     front_m = edge_m + setback_m
     building(builder, draw, (start, end - draw.choice((0.0, 8.0))), front_m, side, 11.0, 14.0)
-    front_garden(builder, draw, side, start, end, edge_m + 0.8, front_m - 0.5)
+    front_garden(builder, draw, Strip(side, start, end, edge_m + 0.8, front_m - 0.5))
     if draw.random() < 0.5:
         hedge(builder, draw, side * (edge_m + 0.5), start, end - draw.uniform(2, 10))
     for _ in range(2 + int(draw.poisson(2.5))):
@@ -185,7 +185,7 @@ def _green(builder: Builder, draw: Generator, start: float, side: float, edge_m:
     if draw.random() < 0.4:
         border(builder, draw, side * (edge_m + 0.5), start, start + BLOCK_M)
     else:
-        verge(builder, draw, side, start, start + BLOCK_M, edge_m, edge_m + 3.0)
+        verge(builder, draw, Strip(side, start, start + BLOCK_M, edge_m, edge_m + 3.0))
     for _ in range(int(draw.poisson(8.0))):
         at = side * (edge_m + draw.uniform(4, 26))
         shrub(builder, draw, start + draw.uniform(0, BLOCK_M), at)
@@ -214,7 +214,7 @@ def _yard(builder: Builder, draw: Generator, start: float, side: float, edge_m: 
                 _car_in_plot(builder, draw, start + 2.2 + _SLOT_M * slot, side, edge_m)
         poster(builder, draw, start + draw.uniform(1, 4), side * (edge_m + 0.6))
     else:
-        building_site(builder, draw, side, start, end, edge_m + 0.5, edge_m + 9.0)
+        building_site(builder, draw, Strip(side, start, end, edge_m + 0.5, edge_m + 9.0))
     if draw.random() < 0.75:
         hall(builder, draw, (start, end), edge_m + draw.uniform(10, 18), side)
     else:
@@ -223,7 +223,7 @@ def _yard(builder: Builder, draw: Generator, start: float, side: float, edge_m: 
 
 def _fields(builder: Builder, draw: Generator, start: float, side: float, edge_m: float) -> None:
     """Open fields behind a verge of tall grass, single trees and poles, a wood far away."""
-    verge(builder, draw, side, start, start + BLOCK_M, edge_m, edge_m + 2.5)
+    verge(builder, draw, Strip(side, start, start + BLOCK_M, edge_m, edge_m + 2.5))
     meadow(builder, draw, side, edge_m)
     for _ in range(int(draw.poisson(3.5))):
         at = side * (edge_m + draw.uniform(1.5, 24))

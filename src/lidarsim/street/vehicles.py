@@ -433,8 +433,8 @@ def motorcycle(draw: Generator) -> Body:
 def recording_car() -> tuple[Primitive, ...]:
     """Roof and rack of the recording car, a station wagon, in the frame of the sensor.
 
-    Source: boxes fitted to the shots without a return in all scans of KITTI: 5 % of all shots, in
-    the lower 22 beams, mostly behind.
+    Source: thin boxes fitted to the shots without a return in all of 24 scans of KITTI: 6.4 % of
+    all shots, in the lower 22 beams, mostly behind.
     """
     look = (Semantic.EGO_VEHICLE, 0.1)
     parts = []

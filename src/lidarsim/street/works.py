@@ -8,7 +8,7 @@ import numpy as np
 from numpy.random import Generator
 
 from lidarsim.scene import Material, Semantic, Shape
-from lidarsim.street.builder import Builder
+from lidarsim.street.builder import Builder, Strip
 
 # Site fences: panels of mesh of 3.5 m x 2.0 m on feet of concrete; a panel holds up about every
 # fourth beam: 6 cm of it, with this chance per metre.
@@ -26,20 +26,13 @@ _NET_PER_M = 25.0
 _STEEL = (Material.PAINT, 0.15)
 
 
-def building_site(
-    builder: Builder,
-    draw: Generator,
-    side: float,
-    first: float,
-    last: float,
-    near_m: float,
-    far_m: float,
-) -> None:
-    """A plot of works between two values of s and two distances from the axis.
+def building_site(builder: Builder, draw: Generator, strip: Strip) -> None:
+    """A plot of works.
 
     A fence of mesh or a row of barriers with cones along the road; behind it heaps, pallets, a skip
     or a hut, sometimes a digger. Cones stand up to 0.8 m outside of the barriers.
     """
+    side, first, last, near_m, far_m = strip
     middle_m = (near_m + far_m) / 2
     if draw.random() < 0.6:
         _mesh_fence(builder, draw, side, first, last, near_m)

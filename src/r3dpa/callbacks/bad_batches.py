@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from lightning import LightningModule
 from torch import Tensor
 
 from r3dpa.io import atomic_path
@@ -56,7 +57,10 @@ def read_bad_batch(path: Path) -> dict[str, Any]:
 
 
 def report_bad_batches(
-    module: Any, batches: list[tuple[int, Any, dict[str, Tensor]]], norms: str, most: int
+    module: LightningModule,
+    batches: list[tuple[int, Any, dict[str, Tensor]]],
+    norms: str,
+    most: int,
 ) -> None:
     """Report and save the batches with a non-finite loss, or all batches if none has one."""
     folder = Path(module.trainer.default_root_dir) / "bad_batches"

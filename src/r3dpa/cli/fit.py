@@ -92,7 +92,7 @@ def _names_stage(words: list[str]) -> bool:
 
 
 def _overview(command: str) -> str:
-    """What a stage command takes, before the options that Lightning lists."""
+    """Return the usage, stages and presets that the help of a stage command begins with."""
     lines = [f"usage: r3dpa {command} STAGE [--preset NAME] [options]"]
     lines += [f"       r3dpa {command} --config FILE [--config FILE ...] [options]", "", "stages:"]
     for stage, path in stage_files().items():

@@ -1,8 +1,8 @@
-"""What the method aligns with: frozen extractors of point features, and their training scans."""
+"""Frozen extractors of 3D point features that the method aligns with."""
 
 from r3dpa.features.dinov2 import DINOv2
 from r3dpa.features.geometric import GeometricFeatures
-from r3dpa.features.scalr import SOURCES, ScaLR, WaffleIronS, WaffleIronS2, feature_source
+from r3dpa.features.scalr import SOURCES, ScaLR, WaffleIronS, feature_source
 from r3dpa.features.voxels import (
     Masking,
     PointCloudBatch,
@@ -22,7 +22,6 @@ __all__ = [
     "ScanGrid",
     "WaffleIron",
     "WaffleIronS",
-    "WaffleIronS2",
     "collate_scans",
     "feature_source",
     "prepare_scan",

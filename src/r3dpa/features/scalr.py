@@ -36,7 +36,7 @@ from r3dpa.features.waffleiron import WaffleIron
 from r3dpa.io import UNPICKLING_ERRORS, atomic_path, first_line, weights_sha256
 
 #: Names that :func:`feature_source` accepts.
-SOURCES = ("scalr", "waffleiron-s", "waffleiron-s-2", "geometric")
+SOURCES = ("scalr", "waffleiron-s", "geometric")
 
 _RELEASED = "ckpt_last.pth of WI_768-DINOv2_ViT_L_14-NS_KI_PD"
 # Entries with the weights in files of the distillation script and of its successor.
@@ -209,21 +209,6 @@ class WaffleIronS(TokenFeatures):
         return values @ self.basis.T
 
 
-class WaffleIronS2(WaffleIronS):
-    """``waffleiron-s-2``: its second edition, also trained on the classes of simulated points.
-
-    Training and evaluation are described in ``README.md`` beside the weights; see
-    :class:`r3dpa.modules.PointSegmentation`.
-
-    Args:
-        weights: File written by that training. Default: the one that comes with the package.
-        dim: Width D of the features, at least the width of the tokens (128 in the shipped file).
-    """
-
-    name = "waffleiron-s-2"
-    shipped = _FOLDER / "waffleiron_s_2.safetensors"
-
-
 def save_weights(path: Path, network: WaffleIron, norm: nn.BatchNorm1d, grid: ScanGrid) -> None:
     """Write what :class:`WaffleIronS` reads; ``norm`` has the statistics of the tokens."""
     state = {f"network.{key}": value for key, value in network.state_dict().items()}
@@ -235,12 +220,11 @@ def save_weights(path: Path, network: WaffleIron, norm: nn.BatchNorm1d, grid: Sc
 
 
 def read_weights(path: Path) -> tuple[dict[str, Tensor], WaffleIron, ScanGrid]:
-    """Float32 content of a file of :func:`save_weights`, with its network rebuilt, and its grid."""
+    """Content of a file of :func:`save_weights`, with its network rebuilt, and its grid."""
     try:
         with safe_open(path, framework="pt") as file:
             about = json.loads(file.metadata()[_ABOUT])
-            stored = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - no dict
-        state = {key: v.float() if v.is_floating_point() else v for key, v in stored.items()}
+            state = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - no dict
         lists = about["grid"]
         settings: dict[str, Any] = {
             key: tuple(lists[key]) if isinstance(lists[key], list) else lists[key] for key in lists
@@ -263,10 +247,9 @@ def feature_source(name: str, ckpt: str | Path | None = None, dim: int = 768) ->
 
     Args:
         name: ``"scalr"``: distilled from images, needs the released checkpoint;
-            ``"waffleiron-s"``: trained on simulated scans without labels; ``"waffleiron-s-2"``:
-            with labels; ``"geometric"``: local shape, without training.
-        ckpt: Weights of ``"scalr"``, or of ``"waffleiron-s"`` and ``"waffleiron-s-2"``, which have
-            default weights.
+            ``"waffleiron-s"``: trained on simulated scans; ``"geometric"``: local shape, without
+            training.
+        ckpt: Weights of ``"scalr"``, or of ``"waffleiron-s"``, which has default weights.
         dim: Width D of the features; for ``"scalr"``, the width of its checkpoint.
     """
     if name not in SOURCES:
@@ -281,9 +264,8 @@ def feature_source(name: str, ckpt: str | Path | None = None, dim: int = 768) ->
         if scalr.dim != dim:
             raise ValueError(f"{ckpt} has features of width {scalr.dim}, but dim is {dim}")
         return scalr
-    for edition in (WaffleIronS, WaffleIronS2):
-        if name == edition.name:
-            return edition(None if ckpt is None else Path(ckpt), dim=dim)
+    if name == "waffleiron-s":
+        return WaffleIronS(None if ckpt is None else Path(ckpt), dim=dim)
     if ckpt is not None:
         raise ValueError(f"feature source {name} has no weights: leave ckpt ({ckpt}) out")
     return GeometricFeatures(dim)
