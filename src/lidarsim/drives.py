@@ -35,7 +35,7 @@ VAL_SHARE = 0.2
 _MANIFEST = "simulation.json"
 _CLASSES = "classes.yaml"  # names of the class ids of the labels
 # Raised whenever the same request gives other scans than before.
-SIMULATOR_VERSION = 3
+SIMULATOR_VERSION = 4
 # Neighbouring scans share their blocks of street, so a worker takes a few in a row.
 _SCANS_PER_TASK = 8
 _Task = tuple[DriveFiles, Simulator, list[int]]  # numbers of the scans of one drive

@@ -79,15 +79,15 @@ def cast(
                 if share > _MOSTLY_OPEN:
                     _cast_window(solids, index, window, turn, nearest, surface)
                 elif share > 0:
-                    beam, shot = np.nonzero(open_ray)
+                    beam, shot = _places(open_ray)
                     beam, shot = beam + window[0].start, shot + window[1].start
-                    alike = np.full(len(beam), index)
-                    _cast_pairs(solids, alike, beam, shot, turn, nearest, surface)
+                    _cast_rays(solids, index, beam, shot, turn, nearest, surface)
         for block in _small_blocks(solids, windows.order[is_small], windows):
             solid_of, beam, shot = _pairs_of(block, windows, origin.shape[2])
-            open_ray = nearest[beam, shot] > windows.near_m[solid_of]
-            solid_of, beam, shot = solid_of[open_ray], beam[open_ray], shot[open_ray]
-            _cast_pairs(solids, solid_of, beam, shot, turn, nearest, surface)
+            open_ray = np.flatnonzero(nearest[beam, shot] > windows.near_m[solid_of])
+            if len(open_ray):
+                solid_of, beam, shot = solid_of[open_ray], beam[open_ray], shot[open_ray]
+                _cast_rays(solids, solid_of, beam, shot, turn, nearest, surface)
     return np.where(surface == NO_SURFACE, np.float32(np.inf), nearest), surface
 
 
@@ -112,18 +112,11 @@ def _cast_window(
     rays = (slice(None), *window)
     start = turn.origin[rays].reshape(3, -1)
     towards = turn.direction[rays].reshape(3, -1)
-    if turn.actor_time_s is not None and solids.velocity[index].any():
-        start = _relative(start, solids.velocity[index], turn.actor_time_s[window].ravel())
-    sloped = bool(solids.grade[index].any())
-    solid = _Solid(solids.matrix[index], solids.offset[index], sloped)
-    distance, leave = _crossing(solids.shape[index], solid, start, towards)
-    if solids.slats[index, 0] > 0:
-        at = start + distance * towards
-        distance = np.where(_meets_slat(solids, index, solid, at), distance, np.float32(np.nan))
+    time_s = None if turn.actor_time_s is None else turn.actor_time_s[window].ravel()
+    drawn = None
     if turn.optical_depth is not None and solids.extinction[index] > 0:
         drawn = _draws_of(index, window, turn.optical_depth).ravel()
-        distance = _inside_medium(distance, drawn, solids.extinction[index])
-    distance = np.where(distance <= leave, distance, np.float32(np.nan))
+    distance = _distance(solids, index, start, towards, time_s, drawn)
     shape = nearest[window].shape
     _keep_nearer(distance.reshape(shape), index, nearest[window], surface[window])
 
@@ -139,25 +132,33 @@ def _small_blocks(
         yield from np.split(alike, np.flatnonzero(np.diff(block_of)) + 1)
 
 
-def _cast_pairs(
+def _cast_rays(
     solids: Solids,
-    solid_of: NDArray[np.int64],
+    index: NDArray[np.int64] | int,
     beam: NDArray[np.int64],
     shot: NDArray[np.int64],
     turn: _Turn,
     nearest: Floats,
     surface: NDArray[np.int32],
 ) -> None:
-    """Keep the hits of pairs (each (K,)) of a solid, all of one shape, and a ray."""
-    if not len(solid_of):
-        return
+    """Keep the hits of K rays on one solid, or of each ray on its own; these have one shape."""
     nearest, surface = nearest.reshape(-1), surface.reshape(-1)
-    ray = beam * turn.origin.shape[2] + shot
-    distance = _pair_distance(solids, solid_of, beam, shot, ray, turn)
+    num_beams, num_shots = turn.origin.shape[1:]
+    ray = beam * num_shots + shot
+    start = turn.origin.reshape(3, -1).take(ray, axis=1)
+    towards = turn.direction.reshape(3, -1).take(ray, axis=1)
+    time_s = None if turn.actor_time_s is None else turn.actor_time_s.reshape(-1)[ray]
+    drawn = None
+    if turn.optical_depth is not None and solids.extinction[index].any():
+        drawn_beam = (beam + _BEAM_STRIDE * index) % num_beams
+        drawn_shot = (shot + _SHOT_STRIDE * index) % num_shots
+        drawn = turn.optical_depth[drawn_beam, drawn_shot]
+    distance = _distance(solids, index, start, towards, time_s, drawn)
     hit = np.flatnonzero((distance > 0) & (distance < nearest[ray]))
-    np.minimum.at(nearest, ray[hit], distance[hit])
-    hit = hit[distance[hit] == nearest[ray[hit]]]
-    surface[ray[hit]] = solid_of[hit]
+    ray, distance = ray[hit], distance[hit]
+    np.minimum.at(nearest, ray, distance)
+    is_nearest = distance == nearest[ray]
+    surface[ray[is_nearest]] = np.broadcast_to(index, beam.shape)[hit[is_nearest]]
 
 
 def _pairs_of(
@@ -175,31 +176,28 @@ def _pairs_of(
     return np.repeat(block, num_rays), beam, shot
 
 
-def _pair_distance(
+def _distance(
     solids: Solids,
-    solid_of: NDArray[np.int64],
-    beam: NDArray[np.int64],
-    shot: NDArray[np.int64],
-    ray: NDArray[np.int64],
-    turn: _Turn,
+    index: NDArray[np.int64] | int,
+    start: Floats,
+    towards: Floats,
+    time_s: Floats | None,
+    drawn: Floats | None,
 ) -> Floats:
-    """Distance (K,) at which each ray meets its own solid; infinite or NaN for none."""
-    start = turn.origin.reshape(3, -1).take(ray, axis=1)
-    towards = turn.direction.reshape(3, -1).take(ray, axis=1)
-    if turn.actor_time_s is not None and solids.velocity[solid_of].any():
-        velocity = solids.velocity.T.take(solid_of, axis=1)
-        start = _relative(start, velocity, turn.actor_time_s.reshape(-1)[ray])
-    solid = _gather(solids, solid_of)
-    distance, leave = _crossing(solids.shape[solid_of[0]], solid, start, towards)
-    if solids.slats[solid_of, 0].any():
-        meets = _meets_slat(solids, solid_of, solid, start + distance * towards)
+    """Distance (K,) at which rays (3, K) meet one solid, or each its own; NaN for a miss.
+
+    ``drawn``: how deep each ray gets into foliage; None where no solid is foliage.
+    """
+    if time_s is not None and solids.velocity[index].any():
+        start = _relative(start, solids.velocity.T.take(index, axis=1), time_s)
+    solid = _solid(solids, index)
+    shape = solids.shape[index] if np.ndim(index) == 0 else solids.shape[index[0]]
+    distance, leave = _crossing(shape, solid, start, towards)
+    if solids.slats[index, 0].any():
+        meets = _meets_slat(solids, index, solid, start + distance * towards)
         distance = np.where(meets, distance, np.float32(np.nan))
-    extinction = solids.extinction[solid_of]
-    if turn.optical_depth is not None and extinction.any():
-        num_beams, num_shots = turn.optical_depth.shape
-        beam = (beam + _BEAM_STRIDE * solid_of) % num_beams
-        shot = (shot + _SHOT_STRIDE * solid_of) % num_shots
-        drawn = turn.optical_depth[beam, shot]
+    if drawn is not None:
+        extinction = solids.extinction[index]
         distance = np.where(extinction > 0, _inside_medium(distance, drawn, extinction), distance)
     return np.where(distance <= leave, distance, np.float32(np.nan))
 
@@ -243,7 +241,12 @@ def cast_single(
         to_ground = (np.float32(solids.ground_m) - origin[2]) / direction[2]
         to_ground[(direction[2] >= 0) | (excluded == GROUND)] = np.nan
         _keep_nearer(to_ground, GROUND, nearest, surface)
-        ray, index = _close_pairs(solids, origin, direction, nearest, time_s, excluded)
+        reach_m = nearest.copy()
+        inside = np.flatnonzero(hollow != NO_SURFACE)
+        reach_m[inside] = np.fmin(
+            reach_m[inside], _far_wall(solids, hollow, inside, origin, direction, time_s)
+        )
+        ray, index = _close_pairs(solids, origin, direction, reach_m, time_s, excluded)
         keep = excluded[ray] != index
         ray, index = ray[keep], index[keep]
         velocity = solids.velocity.T.take(index, axis=1)
@@ -258,6 +261,22 @@ def cast_single(
     return np.where(surface == NO_SURFACE, np.float32(np.inf), nearest), surface
 
 
+def _far_wall(
+    solids: Solids,
+    hollow: NDArray[np.int32],
+    rays: NDArray[np.int64],
+    origin: Floats,
+    direction: Floats,
+    time_s: Floats,
+) -> Floats:
+    """Upper bounds (K,) of the distance at which rays leave the solids that they are inside of."""
+    index = hollow[rays]
+    velocity = solids.velocity.T.take(index, axis=1)
+    start = _relative(origin.take(rays, axis=1), velocity, time_s[rays])
+    _, leave = surface_distance(solids, index, start, direction.take(rays, axis=1))
+    return leave + np.float32(_SLACK_M)
+
+
 def surface_distance(
     solids: Solids, index: NDArray[np.integer], origin: Floats, direction: Floats
 ) -> tuple[Floats, Floats]:
@@ -267,7 +286,7 @@ def surface_distance(
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         for shape in Shape:
             chosen = np.flatnonzero(solids.shape[index] == shape)
-            solid = _gather(solids, index[chosen])
+            solid = _solid(solids, index[chosen])
             start, towards = (array.take(chosen, axis=1) for array in (origin, direction))
             enter[chosen], leave[chosen] = _crossing(shape, solid, start, towards)
     missed = ~(enter <= leave)
@@ -289,7 +308,7 @@ def normals(
     at = position.take(hit, axis=1)
     if time_s is not None and solids.velocity.any():
         at = _relative(at, solids.velocity.T.take(index, axis=1), time_s[hit])
-    solid = _gather(solids, index)
+    solid = _solid(solids, index)
     unit = np.stack(_unit_frame(solid, at, True))
     # The gradient of a solid's equation, by its unit coordinates; of a box the face that is met.
     x, y, z = np.abs(unit)
@@ -338,27 +357,28 @@ def _close_pairs(
     speed = np.hypot(*solids.velocity.T)
     radius = np.hypot(solids.half_size[:, 0], solids.half_size[:, 1])
     radius = radius + speed * np.abs(time_s).max(initial=0.0)
-    centre = np.concatenate([solids.centre[:, :2].T, np.ones((1, len(radius)), np.float32)])
-    # Signed distances of the centres from each ray's line, and along it, seen from above.
-    offset = origin[0] * along[1] - origin[1] * along[0]
-    lines = np.stack([along[1], -along[0], -offset], axis=1)
-    start = np.stack([*along, -(origin[0] * along[0] + origin[1] * along[1])], axis=1)
+    centre = solids.centre[:, :2].T
+    # Signed distances of the centres from each ray's line, seen from above, are
+    # ``sides @ (x, y, 1)``.
+    sides = np.stack([along[1], -along[0], along[0] * origin[1] - along[1] * origin[0]], axis=1)
+    places = np.concatenate([centre, np.ones((1, len(radius)), np.float32)])
     reach_m = reach_m * level_length
     # Rays from one surface in similar directions make narrow blocks, which few solids come near.
     order = np.lexsort((np.arctan2(along[1], along[0]), group))
     pairs = []
     for first in range(0, len(order), _BLOCK_RAYS):
         block = order[first : first + _BLOCK_RAYS]
-        some = _near_block(centre[:2], radius, origin[:2, block], along[:, block])
-        ahead = start[block] @ centre[:, some]
-        close = np.abs(lines[block] @ centre[:, some]) <= radius[some]
-        close &= ahead >= -radius[some]
-        close &= ahead <= reach_m[block, None] + radius[some]
-        ray, index = np.nonzero(close)
-        pairs.append((block[ray], some[index], ahead[ray, index]))
+        longest_m = reach_m[block].max()
+        some = _near_block(centre, radius, origin[:2, block], along[:, block], longest_m)
+        ray, index = _places(np.abs(sides[block] @ places[:, some]) <= radius[some])
+        pairs.append((block[ray], some[index]))
     if not pairs:
         return order, order
-    ray, index, ahead_m = (np.concatenate(column) for column in zip(*pairs, strict=True))
+    ray, index = (np.concatenate(column) for column in zip(*pairs, strict=True))
+    towards = centre.take(index, axis=1) - origin[:2].take(ray, axis=1)
+    ahead_m = (towards * along.take(ray, axis=1)).sum(axis=0)
+    crossed = (ahead_m >= -radius[index]) & (ahead_m <= reach_m[ray] + radius[index])
+    ray, index, ahead_m = ray[crossed], index[crossed], ahead_m[crossed]
     # Heights of the ray where it enters and leaves the circle, and of the solid.
     rise = (direction[2] / level_length)[ray]
     enter = origin[2, ray] + rise * (ahead_m - radius[index]).clip(min=0)
@@ -370,8 +390,13 @@ def _close_pairs(
     return ray[meets], index[meets]
 
 
-def _near_block(centre: Floats, radius: Floats, origin: Floats, along: Floats) -> NDArray[np.int64]:
-    """Circles (of N) within the cone around all of a block's rays, seen from above."""
+def _near_block(
+    centre: Floats, radius: Floats, origin: Floats, along: Floats, longest_m: Floats
+) -> NDArray[np.int64]:
+    """Circles (of N) within the cone around all of a block's rays, seen from above.
+
+    ``longest_m``: the longest of the rays.
+    """
     middle = (origin.min(axis=1) + origin.max(axis=1)) / 2
     apart_m = np.hypot(*(origin - middle[:, None])).max()
     axis = along.sum(axis=1)
@@ -383,15 +408,20 @@ def _near_block(centre: Floats, radius: Floats, origin: Floats, along: Floats) -
     x, y = centre - middle[:, None]
     distance = np.hypot(x, y)
     reach_m = radius + apart_m
+    near = np.flatnonzero(distance <= reach_m + longest_m)
+    x, y, distance, reach_m = x[near], y[near], distance[near], reach_m[near]
     around = distance <= reach_m
     distance[around] = 1  # avoids dividing by 0; these are taken anyway
     off_axis = np.abs(np.arctan2(axis[0] * y - axis[1] * x, axis[0] * x + axis[1] * y))
-    return np.flatnonzero(
-        around | (off_axis <= spread_rad + np.arcsin((reach_m / distance).clip(max=1)))
-    )
+    inside = around | (off_axis <= spread_rad + np.arcsin((reach_m / distance).clip(max=1)))
+    return near[inside]
 
 
-def _gather(solids: Solids, index: NDArray[np.integer]) -> _Solid:
+def _solid(solids: Solids, index: NDArray[np.integer] | int) -> _Solid:
+    """One solid, or one solid per ray."""
+    if np.ndim(index) == 0:
+        sloped = bool(solids.grade[index].any())
+        return _Solid(solids.matrix[index], solids.offset[index], sloped)
     # Taken from rows, so that every row of the result is contiguous.
     matrix = np.ascontiguousarray(np.moveaxis(solids.matrix, 0, 2)).take(index, axis=2)
     offset = np.ascontiguousarray(solids.offset.T).take(index, axis=1)
@@ -404,6 +434,12 @@ def _relative(position: Floats, velocity: Floats, time_s: Floats) -> Floats:
     moved[0] -= velocity[0] * time_s
     moved[1] -= velocity[1] * time_s
     return moved
+
+
+def _places(mask: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows and columns (each (K,)) where a mask is true, eight times as fast as ``np.nonzero``."""
+    row, column = np.divmod(np.flatnonzero(mask), mask.shape[1])
+    return row, column
 
 
 def _keep_nearer(distance: Floats, index: int, nearest: Floats, surface: NDArray[np.int32]) -> None:

@@ -20,6 +20,8 @@ EGO_BODY, NO_SURFACE, GROUND = -3, -2, -1
 # Slack of the windows that choose which rays are tested against a solid: too much only costs
 # time, too little would cut off an object's rim.
 _WINDOW_SLACK_RAD = 2e-3
+# Solids nearer than this many times the spread of the rays' origins may be seen all around.
+_LEAST_GAP = 1.01
 
 
 class Solids(NamedTuple):
@@ -112,39 +114,56 @@ def windows_of(
 ) -> Windows:
     """Beams and shots whose rays can meet each solid, from its bounding box seen from above.
 
-    A moving sensor spreads the origins of the rays over a metre. The first pass allows each ray to
-    start at any of them; the second uses the actual origins of the rays in the first window.
+    The path of the sensor, relative to a solid that moves, spreads the origins of the rays over
+    metres. The first pass allows each ray to start anywhere on it; the second uses the part of the
+    path in the first window.
     """
     fan = _fan(origin, direction)
-    reach = np.zeros(len(solids.shape))
-    if actor_time_s is not None:
-        reach = np.hypot(*solids.velocity.T) * float(np.abs(actor_time_s).max())
-    spread_m = float(np.hypot(origin[0], origin[1]).max()) + reach
-    here = np.zeros((len(solids.shape), 2))
-    wide = _windows_from(solids, fan, max_range_m, here, spread_m)
-    # The origins of each shot: their middle over the beams, and how far the farthest is from it.
+    num_shots = fan.num_shots
+    speed = np.hypot(*solids.velocity.T)
+    # Place and time of each shot: their middle over the beams, and the largest distance from it.
+    # Where the turn ends and begins, some beams are at its end and others at its beginning.
     middle = origin[:2].mean(axis=1)
-    around = np.hypot(*(origin[:2] - middle[:, None])).max(axis=0)
-    if spread_m.max(initial=0.0) < 2 * around.min():
+    apart_m = np.hypot(*(origin[:2] - middle[:, None])).max(axis=0)
+    time_s, apart_s = np.zeros(num_shots), np.zeros(num_shots)
+    if actor_time_s is not None:
+        time_s = actor_time_s.mean(axis=0)
+        apart_s = np.abs(actor_time_s - time_s).max(axis=0)
+
+    def path_of(index: NDArray[np.int64], shot: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Where the sensor is (2, K) in shots, seen from solids that rest at their place."""
+        return middle[:, shot] - solids.velocity[index].T * time_s[shot]
+
+    here = np.zeros((len(speed), 2))
+    spread_m = np.hypot(*middle).max() + apart_m.max() + speed * (np.abs(time_s) + apart_s).max()
+    wide = _windows_from(solids, fan, max_range_m, here, spread_m)
+    if spread_m.max(initial=0.0) < 2 * apart_m.min():
         return wide
-    first = wide.shots[wide.order, 0] % fan.num_shots
+    first = wide.shots[wide.order, 0] % num_shots
     wide_shots = np.diff(wide.shots)[wide.order, 0]
     last = first + wide_shots
-    # The sensor moves on: within a window it is farthest from its middle at one of the ends.
-    at_once = (last <= fan.num_shots) & (wide_shots < fan.num_shots)
-    index = wide.order[at_once]
-    here[index] = middle[:, (first + wide_shots // 2)[at_once]].T
-    ends = np.stack([middle[:, first[at_once]], middle[:, last[at_once] - 1]])
-    away = np.hypot(*np.moveaxis(ends - here[index].T, 1, 0)).max(axis=0)
-    spread_m[index] = away + around.max() + reach[index]
+    # The path is straight: within a window it is farthest from its middle at one of the ends.
+    at_once = (last <= num_shots) & (wide_shots < num_shots)
+    index, first_shot, last_shot = wide.order[at_once], first[at_once], last[at_once]
+    here[index] = path_of(index, (first_shot + last_shot) // 2).T
+    ends = np.stack([path_of(index, first_shot), path_of(index, last_shot - 1)])
+    away_m = np.hypot(*np.moveaxis(ends - here[index].T, 1, 0)).max(axis=0)
+    shots = np.stack([first_shot, last_shot], axis=1)
+    spread_m[index] = away_m + _largest(apart_m, shots) + speed[index] * _largest(apart_s, shots)
     # Where the turn ends and begins, the sensor jumps.
-    for place in np.flatnonzero(~at_once & (wide_shots < fan.num_shots)):
+    for place in np.flatnonzero(~at_once & (wide_shots < num_shots)):
         index = wide.order[place]
-        inside = np.arange(first[place], last[place]) % fan.num_shots
-        here[index] = middle[:, inside[len(inside) // 2]]
-        away = np.hypot(*(middle[:, inside] - here[index][:, None])) + around[inside]
-        spread_m[index] = away.max() + reach[index]
+        inside = np.arange(first[place], last[place]) % num_shots
+        path = path_of(np.full(len(inside), index), inside)
+        here[index] = path[:, len(inside) // 2]
+        away_m = np.hypot(*(path - here[index][:, None]))
+        spread_m[index] = (away_m + apart_m[inside] + speed[index] * apart_s[inside]).max()
     return _windows_from(solids, fan, max_range_m, here, spread_m)
+
+
+def _largest(values: NDArray, ranges: NDArray[np.int64]) -> NDArray:
+    """Largest value in each of the ranges (K, 2) of indices: first, one past the last."""
+    return np.maximum.reduceat(np.append(values, 0), ranges.reshape(-1))[::2]
 
 
 def pieces(index: int, windows: Windows, num_shots: int) -> list[tuple[slice, slice]]:
@@ -207,7 +226,7 @@ def _windows_from(
     local_x = cos_yaw[:, 0] * centre[:, 0] + sin_yaw[:, 0] * centre[:, 1]
     local_y = cos_yaw[:, 0] * centre[:, 1] - sin_yaw[:, 0] * centre[:, 0]
     gap_x, gap_y = np.abs(local_x) - half[:, 0], np.abs(local_y) - half[:, 1]
-    near_m = (np.hypot(gap_x.clip(min=0), gap_y.clip(min=0)) - spread_m).clip(min=0)
+    near_m = np.hypot(gap_x.clip(min=0), gap_y.clip(min=0))
     far_m = np.hypot(corner_x, corner_y).max(axis=1) + spread_m
 
     # Shots: angles of the corners about the centre's direction, widened by how far the rays leave
@@ -215,8 +234,10 @@ def _windows_from(
     heading = np.arctan2(centre[:, 1], centre[:, 0])
     angle = np.arctan2(corner_y, corner_x) - heading[:, None]
     angle = (angle + np.pi) % (2 * np.pi) - np.pi
-    around = near_m <= 2 * spread_m
+    # A corner at the distance d moves by at most asin(spread / d).
+    around = near_m <= _LEAST_GAP * spread_m
     spread_rad = np.arcsin(np.where(around, 1.0, spread_m / np.where(around, 1.0, near_m)))
+    near_m = (near_m - spread_m).clip(min=0)
     margin = _WINDOW_SLACK_RAD + spread_rad
     first = heading + angle.min(axis=1) - margin - fan.most_deviation
     last = heading + angle.max(axis=1) + margin - fan.least_deviation

@@ -15,7 +15,7 @@ from lidarsim.draws import Draws, RayIndex, generator_for
 from lidarsim.raycast import cast, normals
 from lidarsim.scene import Pose, Primitive, Scene
 from lidarsim.sensors.spinning import SpinningLidar
-from lidarsim.solids import EGO_BODY, NO_SURFACE, Floats, level, solids_of, subset
+from lidarsim.solids import EGO_BODY, NO_SURFACE, Floats, level, solids_of
 from lidarsim.sweep import Effect, Origin, Sweep
 
 # Widths of a clump in beams and shots, smaller and larger ones alike, and the spread of the
@@ -75,15 +75,8 @@ class MovingActors(Effect):
         count = sum(any(p.velocity_m_s) for p in scene.primitives)
         return f"{count} moving solids" if count else None
 
-    def rays(self, sweep: Sweep) -> RayIndex:
-        """Rays whose azimuth window meets a moving solid at any time of the sweep."""
-        return sweep.all_near(
-            subset(sweep.solids, np.any(sweep.solids.velocity, axis=1)), sweep.time_s
-        )
-
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
-        sweep.actor_time_s = np.zeros_like(sweep.time_s)
-        sweep.actor_time_s[rays] = sweep.time_s[rays]
+        sweep.actor_time_s = sweep.time_s
 
 
 class FoliageOcclusion(Effect):

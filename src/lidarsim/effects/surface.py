@@ -99,7 +99,7 @@ class SurfaceTexture(Effect):
         leaf_spread: s of leaves, whose orientation is random.
     """
 
-    spread: float = 0.36
+    spread: float = 0.32
     leaf_spread: float = 0.62
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:

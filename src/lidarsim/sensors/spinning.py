@@ -85,7 +85,7 @@ class SpinningLidar:
     overlap_range_m: float = 5.0  # from here on the receiver sees the whole beam
     threshold_spread: float = 0.3  # standard deviation of the logarithm of the threshold
     lost_share: float = 0.001  # of shots at the ground that are lost, see ``effects.instrument``
-    range_sigma_m: float = 0.008  # range noise of a strong return
+    range_sigma_m: float = 0.0075  # range noise of a strong return
     weak_range_sigma_m: float = 0.05  # further noise at a signal-to-noise ratio of 1/2
     range_step_m: float = 0.002  # in which ranges are reported; 0 for none
     return_mode: Literal["strongest", "dual"] = "strongest"  # or the two strongest of a shot

@@ -18,7 +18,7 @@ SCAN_PERIOD_S = 0.1
 
 _CAMBER = 0.02
 # Lanes and pavements of German residential streets.
-_LANE_M, _PAVEMENT_M = (2.75, 3.25), (1.5, 2.8)
+_LANE_M, _PAVEMENT_M = (2.75, 3.25), (1.6, 3.2)
 _GUTTER_M = (0.5, 0.9)
 _PARKING_M = 2.1
 # Bins are emptied on one working day of five.
@@ -64,18 +64,18 @@ _TOWN = Character(
 )  # fmt: skip
 _ROW_HOUSES = Character(
     lanes=((1, 1), (1, 0)), districts=(0.1, 0.55, 0.2, 0.1, 0.05, 0.0, 0.0),
-    parked=(0.14, 0.45), parking=0.8, pavement=0.95, clutter=1.2, people=0.15, lights=False,
+    parked=(0.14, 0.45), parking=0.8, pavement=0.95, clutter=1.4, people=0.15, lights=False,
     island=0.1, car_gap_m=(60, 140), people_gap_m=(50, 140), crossing_every=(4, 8), slope=0.02,
 )  # fmt: skip
 _SUBURB = Character(
     lanes=((1, 1), (1, 0)), districts=(0.05, 0.15, 0.65, 0.05, 0.1, 0.0, 0.0),
-    parked=(0.1, 0.41), parking=0.75, pavement=0.95, clutter=1.0, people=0.15, lights=False,
+    parked=(0.1, 0.41), parking=0.75, pavement=0.95, clutter=1.25, people=0.15, lights=False,
     island=0.1, car_gap_m=(60, 140), people_gap_m=(60, 160), crossing_every=(4, 8), slope=0.025,
 )  # fmt: skip
 _GREEN = Character(
     lanes=((1, 1),), districts=(0.05, 0.05, 0.15, 0.1, 0.55, 0.1, 0.0),
     parked=(0.07, 0.3), parking=0.4, pavement=0.6, clutter=0.3, people=0.05, lights=False,
-    island=0.2, car_gap_m=(60, 140), people_gap_m=(80, 200), crossing_every=(6, 10), slope=0.03,
+    island=0.2, car_gap_m=(60, 140), people_gap_m=(80, 200), crossing_every=(6, 10), slope=0.025,
 )  # fmt: skip
 _ARTERIAL = Character(
     lanes=((2, 2), (2, 1), (2, 2)), districts=(0.1, 0.05, 0.15, 0.2, 0.4, 0.1, 0.0),
@@ -85,7 +85,7 @@ _ARTERIAL = Character(
 _COUNTRY = Character(
     lanes=((1, 1),), districts=(0.0, 0.0, 0.2, 0.0, 0.3, 0.05, 0.45),
     parked=(0.03, 0.22), parking=0.15, pavement=0.3, clutter=0.2, people=0.03, lights=False,
-    island=0.2, car_gap_m=(60, 160), people_gap_m=(120, 300), crossing_every=(8, 12), slope=0.03,
+    island=0.2, car_gap_m=(60, 160), people_gap_m=(120, 300), crossing_every=(8, 12), slope=0.025,
 )  # fmt: skip
 
 #: Surroundings by the number of the drive, in turn: KITTI-360 leads mostly through suburbs.
