@@ -26,7 +26,7 @@ ELSEWHERE = {  # by the test that starts them
     "experiment/rgb_pretraining demo/rgb_pretraining net/sd_vae",
     "test_shipped_networks": "net/vae_h2p4d8 net/vae_h1p4d4 net/vae_h16d4 net/vae_h16p2d16",
     "test_stage_cli": "data/points experiment/waffleiron_s data/labelled_points "
-    "experiment/waffleiron_s_2",
+    "experiment/waffleiron_s_2 r3dpa_s_2/trainer r3dpa_s_2/data r3dpa_s_2/teacher",
     "test_documented_commands": "launch/nodes data/kitti360_paper",
     "test_baselines": "demo/lidm demo/lidm_first_stage demo/r2dm demo/r2flow "
     + " ".join(f"baseline/{path.stem}" for path in CONF.glob("baseline/*.yaml")),

@@ -209,10 +209,17 @@ class WaffleIronS(TokenFeatures):
         return values @ self.basis.T
 
 
-def save_weights(path: Path, network: WaffleIron, norm: nn.BatchNorm1d, grid: ScanGrid) -> None:
-    """Write what :class:`WaffleIronS` reads; ``norm`` has the statistics of the tokens."""
+def save_weights(
+    path: Path, network: WaffleIron, norm: nn.BatchNorm1d, grid: ScanGrid, half: bool = False
+) -> None:
+    """Write what :class:`WaffleIronS` reads; ``norm`` has the statistics of the tokens.
+
+    ``half`` stores floating-point values as float16, in half the bytes.
+    """
     state = {f"network.{key}": value for key, value in network.state_dict().items()}
     state |= {f"norm.{key}": value for key, value in norm.state_dict().items()}
+    if half:
+        state = {k: v.half() if v.is_floating_point() else v for k, v in state.items()}
     state = {key: value.detach().cpu().contiguous() for key, value in state.items()}
     about = {"width": network.width, "depth": network.depth, "grid": asdict(grid)}
     with atomic_path(path) as temporary:
@@ -220,11 +227,12 @@ def save_weights(path: Path, network: WaffleIron, norm: nn.BatchNorm1d, grid: Sc
 
 
 def read_weights(path: Path) -> tuple[dict[str, Tensor], WaffleIron, ScanGrid]:
-    """Content of a file of :func:`save_weights`, with its network rebuilt, and its grid."""
+    """Content of a file of :func:`save_weights` in float32, its network rebuilt, and its grid."""
     try:
         with safe_open(path, framework="pt") as file:
             about = json.loads(file.metadata()[_ABOUT])
             state = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - no dict
+        state = {k: v.float() if v.is_floating_point() else v for k, v in state.items()}
         lists = about["grid"]
         settings: dict[str, Any] = {
             key: tuple(lists[key]) if isinstance(lists[key], list) else lists[key] for key in lists

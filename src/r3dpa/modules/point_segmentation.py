@@ -33,6 +33,8 @@ class PointSegmentation(PointPretraining):
         warmup: Steps.
     """
 
+    writes_half = True
+
     def __init__(
         self,
         network: WaffleIron,
