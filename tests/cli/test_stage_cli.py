@@ -207,9 +207,13 @@ def trained_teacher(smoke_root, run_dir, *more):
     return trained(configs, words, run_dir, *more)
 
 
-def trained_with_classes(smoke_root, run_dir, *more):
+def trained_judge(smoke_root, run_dir, *more):
+    return trained_with_classes(smoke_root, run_dir, *more, experiment="waffleiron_judge")
+
+
+def trained_with_classes(smoke_root, run_dir, *more, experiment="waffleiron_s_2"):
     configs = ["trainer.yaml", "r3dpa_s_2/trainer.yaml", "data/labelled_points.yaml"]
-    configs.append("experiment/waffleiron_s_2.yaml")
+    configs.append(f"experiment/{experiment}.yaml")
     words = [f"--{key}={value}" for key, value in (TEACHER | SIMULATED).items()]
     words += [f"--data.init_args.source.init_args.root={run_dir.parent / 'images'}"]
     return trained(configs, words, run_dir, *more)
@@ -222,15 +226,16 @@ def trained(configs, settings, run_dir, *more):
     return torch.load(run_dir / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
 
 
-@pytest.mark.parametrize("train", [trained_teacher, trained_with_classes])
+@pytest.mark.parametrize("train", [trained_teacher, trained_with_classes, trained_judge])
 def test_the_point_teacher_trains_resumes_exactly_and_gives_a_source(train, smoke_root, tmp_path):
     whole = train(smoke_root, tmp_path / "whole")
     middle = tmp_path / "whole" / "checkpoints" / "step=0000001.ckpt"
     resumed = train(smoke_root, tmp_path / "rest", f"--ckpt_path={middle}")
     for key, value in whole.items():
         assert torch.equal(resumed[key], value), key
-    weights = tmp_path / "rest" / "waffleiron_s.safetensors"
-    features = feature_source("waffleiron-s", weights, dim=16)(torch.rand(50, 4) * 10)
+    (weights,) = (tmp_path / "rest").glob("*.safetensors")
+    name = weights.stem.replace("_", "-")
+    features = feature_source(name, weights, dim=16)(torch.rand(50, 4) * 10)
     assert features.shape == (50, 16)
     assert torch.allclose(features.norm(dim=1), torch.ones(50), atol=1e-5)
     with safe_open(weights, "pt") as file:
@@ -260,7 +265,7 @@ def test_one_command_simulates_then_adds_scans_and_the_grids_of_a_teacher(tmp_pa
     weights = feature_source("waffleiron-s").shipped
     extractor = f"--data.init_args.extractor.init_args.weights={weights}"
     main([*words, f"--config={teacher}", extractor])
-    grids = tmp_path / "feature_grids" / "waffleiron-s"
+    grids = tmp_path / "feature_grids" / "waffleiron-s-2"
     assert f"2 scans to train, 1 held out; feature grids: {grids}" in capsys.readouterr().out
     counts = [
         sum(len(path.read_text().splitlines()) for path in folder.glob("*.jsonl"))
