@@ -146,13 +146,13 @@ r3dpa-s: $(READY) ## train the second edition of r3dpa-s: 20 hours of a core; st
 		--model.init_args.init_from $(SECOND)/vae/checkpoints/last.ckpt
 	$(FIT_SECOND) $(SECOND_ALIGNED) --config conf/r3dpa_s_2/joint.yaml --run_dir $(SECOND)/joint \
 		--model.init_args.init_from $(SECOND)/flow/checkpoints/last.ckpt
-	$(FIT_SECOND) $(SECOND_DATA) --config conf/r3dpa_s_2/flow_matching.yaml \
+	$(FIT_SECOND) $(SECOND_ALIGNED) --config conf/r3dpa_s_2/flow_matching.yaml \
 		--config conf/r3dpa_s_2/few_step.yaml --run_dir $(SECOND)/few_step \
 		--model.init_args.init_from $(SECOND)/joint/checkpoints/last.ckpt
-	$(BIN)/r3dpa convert $(SECOND)/joint/checkpoints/last.ckpt $(SECOND)/aligned.safetensors \
+	$(BIN)/r3dpa convert $(SECOND)/few_step/checkpoints/last.ckpt $(SECOND)/r3dpa-s.safetensors \
 		--networks vae ema ema_latent_norm --half --overwrite
-	$(BIN)/r3dpa data objects --data conf/r3dpa_s_2/data.yaml --ckpt $(SECOND)/aligned.safetensors \
-		--features_ckpt $(SECOND)/teacher/waffleiron_s_2.safetensors --out $(SECOND)/aligned.objects
+	$(BIN)/r3dpa data objects --data conf/r3dpa_s_2/data.yaml --ckpt $(SECOND)/r3dpa-s.safetensors \
+		--features_ckpt $(SECOND)/teacher/waffleiron_s_2.safetensors --out $(SECOND)/r3dpa-s.objects
 
 r3dpa-s-control: $(READY) ## its control without alignment, latent noise and joint stage: after make r3dpa-s
 	$(FIT_SECOND) $(SECOND_DATA) --config conf/r3dpa_s_2/vae_alignment.yaml \

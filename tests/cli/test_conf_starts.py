@@ -57,7 +57,7 @@ R3DPA_S_2 = {
     "vae": ("vae_alignment",),
     "flow": ("teacher", "flow_matching"),
     "joint": ("teacher", "joint"),
-    "few_step": ("flow_matching", "few_step"),
+    "few_step": ("teacher", "flow_matching", "few_step"),
     "control_vae": ("vae_alignment", "control_vae"),
     "control_flow": ("flow_matching", "control_flow"),
 }
