@@ -32,13 +32,21 @@ REAL := $(DATA)
 endif
 FIT := $(BIN)/r3dpa fit --config conf/trainer.yaml --config conf/r3dpa_s/trainer.yaml $(SOURCE)
 endif
-# The long training of r3dpa-s; the same command continues an interrupted run.
-R3DPA_S_FIT := nice -n 19 $(BIN)/r3dpa fit --config conf/trainer.yaml --config conf/r3dpa_s/trainer.yaml \
+# The long training of r3dpa-s; the same command continues an interrupted run. The shipped weights are
+# of the first edition, which has other streets and no teacher.
+SECOND := runs/r3dpa_s_2
+FIT_SECOND := OMP_NUM_THREADS=1 nice -n 19 $(BIN)/r3dpa fit --config conf/trainer.yaml \
+	--config conf/r3dpa_s_2/trainer.yaml --ckpt_path last
+SCANS ?= 8000
+SECOND_DATA := --config conf/r3dpa_s_2/data.yaml --data.init_args.num_scans $(SCANS)
+SECOND_ALIGNED := $(SECOND_DATA) --config conf/r3dpa_s_2/teacher.yaml
+FIT_FIRST := nice -n 19 $(BIN)/r3dpa fit --config conf/trainer.yaml --config conf/r3dpa_s/trainer.yaml \
 	--config conf/r3dpa_s/data.yaml --ckpt_path last
 
 .DEFAULT_GOAL := help
 .PHONY: help install format lint types test test-lowest test-all test-numerics \
-	test-faults test-nodes fuzz notebooks demo gallery r3dpa-s r3dpa-s-scores docs clean bench bench-training \
+	test-faults test-nodes fuzz notebooks demo gallery r3dpa-s \
+	r3dpa-s-control r3dpa-s-first r3dpa-s-scores docs clean bench bench-training \
 	bench-sampling bench-gpu ablations
 
 help: ## list the targets
@@ -128,17 +136,42 @@ endif
 gallery: $(READY) ## one page of 64 scenes in order, their nearest training scans, edits, weather
 	$(BIN)/r3dpa gallery --out runs/gallery.html $(if $(wildcard runs/r3dpa_s/data),--data conf/r3dpa_s/data.yaml)
 
-r3dpa-s: $(READY) ## train the weights of the package: an hour of a GPU, days of two cores; stop and repeat at any time
-	$(R3DPA_S_FIT) --config conf/r3dpa_s/vae_alignment.yaml --run_dir runs/r3dpa_s/vae
-	$(R3DPA_S_FIT) --config conf/r3dpa_s/vae_alignment.yaml --config conf/r3dpa_s/vae_more.yaml \
+r3dpa-s: $(READY) ## train the second edition of r3dpa-s: 20 hours of a core; stop and repeat at any time [SCANS=8000]
+	OMP_NUM_THREADS=1 nice -n 19 $(BIN)/r3dpa data prepare $(SECOND_DATA)
+	$(FIT_SECOND) --config conf/data/labelled_points.yaml --config conf/experiment/waffleiron_s_2.yaml \
+		--run_dir $(SECOND)/teacher
+	OMP_NUM_THREADS=1 nice -n 19 $(BIN)/r3dpa data prepare $(SECOND_ALIGNED)
+	$(FIT_SECOND) $(SECOND_DATA) --config conf/r3dpa_s_2/vae_alignment.yaml --run_dir $(SECOND)/vae
+	$(FIT_SECOND) $(SECOND_ALIGNED) --config conf/r3dpa_s_2/flow_matching.yaml --run_dir $(SECOND)/flow \
+		--model.init_args.init_from $(SECOND)/vae/checkpoints/last.ckpt
+	$(FIT_SECOND) $(SECOND_ALIGNED) --config conf/r3dpa_s_2/joint.yaml --run_dir $(SECOND)/joint \
+		--model.init_args.init_from $(SECOND)/flow/checkpoints/last.ckpt
+	$(FIT_SECOND) $(SECOND_ALIGNED) --config conf/r3dpa_s_2/flow_matching.yaml \
+		--config conf/r3dpa_s_2/few_step.yaml --run_dir $(SECOND)/few_step \
+		--model.init_args.init_from $(SECOND)/joint/checkpoints/last.ckpt
+	$(BIN)/r3dpa convert $(SECOND)/few_step/checkpoints/last.ckpt $(SECOND)/r3dpa-s.safetensors \
+		--networks vae ema ema_latent_norm --half --overwrite
+	$(BIN)/r3dpa data objects --data conf/r3dpa_s_2/data.yaml --ckpt $(SECOND)/r3dpa-s.safetensors \
+		--features_ckpt $(SECOND)/teacher/waffleiron_s_2.safetensors --out $(SECOND)/r3dpa-s.objects
+
+r3dpa-s-control: $(READY) ## its control without alignment, latent noise and joint stage: after make r3dpa-s
+	$(FIT_SECOND) $(SECOND_DATA) --config conf/r3dpa_s_2/vae_alignment.yaml \
+		--config conf/r3dpa_s_2/control_vae.yaml --run_dir $(SECOND)/control_vae
+	$(FIT_SECOND) $(SECOND_DATA) --config conf/r3dpa_s_2/flow_matching.yaml \
+		--config conf/r3dpa_s_2/control_flow.yaml --run_dir $(SECOND)/control_flow \
+		--model.init_args.init_from $(SECOND)/control_vae/checkpoints/last.ckpt
+
+r3dpa-s-first: $(READY) ## train the shipped weights, the first edition: an hour of a GPU, days of two cores
+	$(FIT_FIRST) --config conf/r3dpa_s/vae_alignment.yaml --run_dir runs/r3dpa_s/vae
+	$(FIT_FIRST) --config conf/r3dpa_s/vae_alignment.yaml --config conf/r3dpa_s/vae_more.yaml \
 		--run_dir runs/r3dpa_s/vae_more \
 		--model.init_args.init_from runs/r3dpa_s/vae/checkpoints/last.ckpt
-	$(R3DPA_S_FIT) --config conf/r3dpa_s/vae_alignment.yaml --config conf/r3dpa_s/vae_decoder.yaml \
+	$(FIT_FIRST) --config conf/r3dpa_s/vae_alignment.yaml --config conf/r3dpa_s/vae_decoder.yaml \
 		--run_dir runs/r3dpa_s/vae_decoder \
 		--model.init_args.init_from runs/r3dpa_s/vae_more/checkpoints/last.ckpt
-	$(R3DPA_S_FIT) --config conf/r3dpa_s/flow_matching.yaml --run_dir runs/r3dpa_s/flow \
+	$(FIT_FIRST) --config conf/r3dpa_s/flow_matching.yaml --run_dir runs/r3dpa_s/flow \
 		--model.init_args.init_from runs/r3dpa_s/vae_decoder/checkpoints/last.ckpt
-	$(R3DPA_S_FIT) --config conf/r3dpa_s/flow_matching.yaml --config conf/r3dpa_s/few_step.yaml \
+	$(FIT_FIRST) --config conf/r3dpa_s/flow_matching.yaml --config conf/r3dpa_s/few_step.yaml \
 		--run_dir runs/r3dpa_s/few_step \
 		--model.init_args.init_from runs/r3dpa_s/flow/checkpoints/last.ckpt \
 		--model.init_args.latents_dir runs/r3dpa_s/flow/latents

@@ -44,7 +44,7 @@ def test_a_name_a_file_and_a_repository_are_taken_alike(shipped, monkeypatch):
     expected = first.generate(2).range_m
     for other in others:
         assert torch.equal(other.generate(2).range_m, expected)
-    assert asked == [("owner/name", ["*.safetensors", "*.yaml"])]
+    assert asked == [("owner/name", ["*.safetensors", "*.yaml", "*.objects"])]
     assert SceneVAE.from_pretrained("tiny", "cpu").vae.latent_channels == first.sit.in_channels
     assert read_checkpoint("hf://owner/name/tiny.safetensors").path == sources[1]
 

@@ -18,7 +18,11 @@ _OF_STAGE = {
     "lidm_first_stage": ["lidm"],
 }
 _OF_NETWORK = {"VAE": "lidm", "SiT": "sit", "AverageVelocitySiT": "sit"}
-_OF_FEATURES = {"waffleiron-s": ["waffleiron"], "scalr": ["scalr", "waffleiron"]}
+_OF_FEATURES = {
+    "waffleiron-s": ["waffleiron"],
+    "waffleiron-s-2": ["waffleiron"],
+    "scalr": ["scalr", "waffleiron"],
+}
 
 
 def cite(ckpt: str = DEFAULT_WEIGHTS) -> str:

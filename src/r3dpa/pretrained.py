@@ -11,6 +11,8 @@ from r3dpa.io import first_line, text_table
 
 DEFAULT_WEIGHTS = "r3dpa-s"
 """Name of the weights that commands use without ``--ckpt``."""
+OBJECTS_SUFFIX = ".objects"
+"""Of the file of mean features of object classes beside the weights of the same name."""
 _FOLDER = Path(__file__).parent / "weights"
 _HUB = "hf:/"  # a Path joins the two slashes of hf://
 
@@ -54,6 +56,22 @@ def weights_file(source: str | Path) -> Path:
     raise FileNotFoundError(
         f"{missing}; give an existing file, hf://owner/name, or a name of `r3dpa models` ({names})"
     )
+
+
+def objects_file(source: str | Path) -> Path:
+    """File of mean features of object classes beside a checkpoint, see :func:`weights_file`.
+
+    Raises:
+        FileNotFoundError: If there is none.
+    """
+    weights = weights_file(source)
+    path = weights.with_suffix(OBJECTS_SUFFIX)
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"no object features {path} beside {weights.name}: write them with `r3dpa data "
+            "objects`, or give a file of it as --objects"
+        )
+    return path
 
 
 def check_features(source: str | Path) -> None:
@@ -108,7 +126,8 @@ def _from_hub(place: str) -> Path:
         raise ValueError(
             f"hf://{place}: downloads need huggingface_hub: pip install 'r3dpa[hub]'"
         ) from None
-    patterns = [file, f"{Path(file).stem}.yaml"] if file else ["*.safetensors", "*.yaml"]
+    stem = Path(file).stem if file else "*"
+    patterns = [file or "*.safetensors", f"{stem}.yaml", f"{stem}{OBJECTS_SUFFIX}"]
     try:
         folder = Path(snapshot_download(f"{owner}/{name}", allow_patterns=patterns))
     except (OSError, ValueError) as error:  # requests' errors are OSErrors

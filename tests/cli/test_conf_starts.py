@@ -26,7 +26,7 @@ ELSEWHERE = {  # by the test that starts them
     "experiment/rgb_pretraining demo/rgb_pretraining net/sd_vae",
     "test_shipped_networks": "net/vae_h2p4d8 net/vae_h1p4d4 net/vae_h16d4 net/vae_h16p2d16",
     "test_stage_cli": "data/points experiment/waffleiron_s data/labelled_points "
-    "experiment/waffleiron_s_2",
+    "experiment/waffleiron_s_2 experiment/waffleiron_judge",
     "test_documented_commands": "launch/nodes data/kitti360_paper",
     "test_baselines": "demo/lidm demo/lidm_first_stage demo/r2dm demo/r2flow "
     + " ".join(f"baseline/{path.stem}" for path in CONF.glob("baseline/*.yaml")),
@@ -52,6 +52,14 @@ R3DPA_S = {  # in the order given
     "few_step": ("data", "flow_matching", "few_step"),
     "demo": ("demo_data", "vae_alignment", "demo_vae"),
     "demo_flow": ("demo_folder", "flow_matching", "demo_flow"),
+}
+R3DPA_S_2 = {
+    "vae": ("vae_alignment",),
+    "flow": ("teacher", "flow_matching"),
+    "joint": ("teacher", "joint"),
+    "few_step": ("teacher", "flow_matching", "few_step"),
+    "control_vae": ("vae_alignment", "control_vae"),
+    "control_flow": ("flow_matching", "control_flow"),
 }
 VELOCITIES = sorted(path.stem for kind in ("sit", "unet") for path in CONF.glob(f"net/{kind}_*"))
 QUIET = {
@@ -79,6 +87,11 @@ def test_no_file_is_left_out():
         f"r3dpa_s/{name}"
         for names in R3DPA_S.values()
         for name in (*names, "vae", "sit", "trainer")
+    }
+    started |= {
+        f"r3dpa_s_2/{name}"
+        for names in R3DPA_S_2.values()
+        for name in (*names, "data", "vae", "sit", "trainer")
     }
     elsewhere = set(" ".join(ELSEWHERE.values()).split())
     assert files == started | elsewhere
@@ -118,7 +131,7 @@ def start_flow(folder, vae, size, sit=None, codec=RangeCodec()):
         "latent_norm": NetworkState.of(norm, {"channels": channels}),
     }
     if sit is not None:
-        networks["ema"] = NetworkState.of(SiT(**sit), sit)
+        networks["ema"] = networks["sit"] = NetworkState.of(SiT(**sit), sit)
         networks["ema_latent_norm"] = networks["latent_norm"]
     content = Checkpoint(Path("v"), "vae_alignment", networks, geometry=geometry.to_dict())
     return {"model.init_args.init_from": save_checkpoint(content, folder / "vae.safetensors")}
@@ -190,6 +203,36 @@ def test_r3dpa_s_and_its_demo_start(name, start, smoke_root, tmp_path):
         settings |= start_flow(tmp_path, vae, (16, 64), exported, codec)
     configs = ["trainer", *(f"r3dpa_s/{part}" for part in ("trainer", *given))]
     start(configs, settings)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [n if n == "joint" else pytest.param(n, marks=pytest.mark.slow) for n in R3DPA_S_2],
+)
+def test_the_second_edition_of_r3dpa_s_starts(name, start, tmp_path):
+    vae, sit = (
+        yaml.safe_load((CONF / f"r3dpa_s_2/{part}.yaml").read_text())["init_args"]
+        for part in ("vae", "sit")
+    )
+    sit["input_size"] = [2, 4]
+    settings = {
+        "data.init_args.sensor": "{beams: 16, columns: 64}",
+        "data.init_args.grid_size": "[1, 4]",
+        "model.init_args.sit.init_args.input_size": "[2, 4]",
+        "data.init_args.root": tmp_path / "data",
+        "data.init_args.num_scans": 4,
+    }
+    if "teacher" in R3DPA_S_2[name]:
+        settings["data.init_args.extractor"] = (
+            f"{{class_path: {GEOMETRIC}, init_args: {{dim: 128}}}}"
+        )
+    if name == "vae":
+        vae = {key: value for key, value in vae.items() if key not in ("intensity", "num_classes")}
+    channels = {} if name == "vae" else {"intensity_channel": True, "num_classes": 15}
+    codec = RangeCodec("log2", return_channel=True, **channels)
+    settings |= start_flow(tmp_path, vae, (16, 64), sit, codec)
+    files = ("trainer", "data", *R3DPA_S_2[name])
+    start(["trainer", *(f"r3dpa_s_2/{part}" for part in files)], settings)
 
 
 def test_feature_grids_have_the_tokens_of_the_sit_and_come_from_shipped_weights():

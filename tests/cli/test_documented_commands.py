@@ -59,7 +59,15 @@ def spans_of(text, command):
 # Targets whose recipes call `r3dpa`, in each of their variants.
 MAKE = (
     *("demo", "demo DATA=scans", "demo SCRATCH=1", "demo SCRATCH=1 DATA=scans"),
-    *("gallery", "r3dpa-s", "bench-training", "bench-sampling", "bench-gpu CKPT=a.ckpt"),
+    *(
+        "gallery",
+        "r3dpa-s",
+        "r3dpa-s-control",
+        "r3dpa-s-first",
+        "bench-training",
+        "bench-sampling",
+        "bench-gpu CKPT=a.ckpt",
+    ),
     "ablations",
 )
 
@@ -155,15 +163,15 @@ def test_recipes_are_read_whole():
     called, target = set(), ""
     for line in MAKEFILE.splitlines():
         target = line.partition(":")[0] if re.match(r"[\w-]+:", line) else target
-        if line.startswith("\t") and re.search(r"/r3dpa |FIT\)", line):
+        if line.startswith("\t") and re.search(r"/r3dpa |FIT(_\w+)?\)", line):
             called.add(target)
     assert called == {words.split()[0] for words in MAKE}
 
 
 def test_a_missing_variable_of_the_makefile_fails(tmp_path):
     renamed = tmp_path / "Makefile"
-    renamed.write_text(MAKEFILE.replace("R3DPA_S_FIT :=", "FIT_OF_R3DPA_S :="))
-    with pytest.raises(AssertionError, match="undefined variable 'R3DPA_S_FIT'"):
+    renamed.write_text(MAKEFILE.replace("FIT_SECOND :=", "SECOND_FIT :="))
+    with pytest.raises(AssertionError, match="undefined variable 'FIT_SECOND'"):
         recipe_of("r3dpa-s", renamed)
 
 

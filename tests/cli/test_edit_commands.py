@@ -103,6 +103,17 @@ class TestFiles:
         assert "before: scan a" in page
         assert "inpaint 1" in page
 
+        # Without --objects, the library beside the weights.
+        beside = files / "geometric.objects"
+        with pytest.raises(FileNotFoundError, match=r"no object features .*geometric\.objects"):
+            edit(files, "inpaint", tmp_path / "beside", *scan, "--object", "car")
+        beside.write_bytes((files / "lib.safetensors").read_bytes())
+        about = edit(files, "inpaint", tmp_path / "beside", *scan, "--object", "car")
+        assert about["objects"] == str(beside)
+        assert np.array_equal(np.load(tmp_path / "beside" / "range_m.npy"), made.numpy())
+        edit(files, "inpaint", tmp_path / "tree", *scan, "--object", "tree")
+        beside.unlink()
+
         # The mask that was written is one that can be read.
         again = ["--scan", files / "a.bin", "--mask", tmp_path / "o" / "mask.png"]
         edit(files, "inpaint", tmp_path / "again", *again, *library)
@@ -223,7 +234,7 @@ class TestComplete:
 
 REFUSED = [
     ("inpaint", "", "one of --box, --box3d and --mask"),
-    ("inpaint", "--mask m.png --object car", "--objects FILE and --object NAME go together"),
+    ("inpaint", "--mask m.png --objects lib.safetensors", "--objects FILE needs --object NAME"),
     ("inpaint", "--mask m.png --strength 0.3", "--strength and --window need"),
     (
         "inpaint",
@@ -261,7 +272,7 @@ def test_bad_input_is_refused_before_networks_run(
     "words",
     [
         "mix --left a.bin --right b.bin --out o",
-        "inpaint --scan a.bin --objects lib.safetensors --object car --mask m.png --out o",
+        "inpaint --scan a.bin --object car --mask m.png --out o",
         "objects --data data --out o.safetensors",
     ],
 )

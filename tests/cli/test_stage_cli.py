@@ -10,8 +10,8 @@ import torch
 import wandb
 import yaml
 from lightning.pytorch.demos.boring_classes import BoringModel
+from safetensors import safe_open
 
-from lidarsim import simulate
 from r3dpa.cli import main
 from r3dpa.cli.features import with_data_class
 from r3dpa.cli.presets import conf_folder
@@ -207,13 +207,16 @@ def trained_teacher(smoke_root, run_dir, *more):
     return trained(configs, words, run_dir, *more)
 
 
-def trained_with_classes(smoke_root, run_dir, *more):
-    simulate(smoke_root, scans=12)
-    configs = ["trainer.yaml", "data/labelled_points.yaml", "experiment/waffleiron_s_2.yaml"]
-    words = [f"--{key}={value}" for key, value in TEACHER.items()]
-    words += [f"--data.init_args.source.init_args.scans={smoke_root}"]
-    words += ["--data.init_args.source.init_args.val_drives=[2013_05_28_drive_0000_sync]"]
-    return trained(configs, [*words, "--model.init_args.start=null"], run_dir, *more)
+def trained_judge(smoke_root, run_dir, *more):
+    return trained_with_classes(smoke_root, run_dir, *more, experiment="waffleiron_judge")
+
+
+def trained_with_classes(smoke_root, run_dir, *more, experiment="waffleiron_s_2"):
+    configs = ["trainer.yaml", "r3dpa_s_2/trainer.yaml", "data/labelled_points.yaml"]
+    configs.append(f"experiment/{experiment}.yaml")
+    words = [f"--{key}={value}" for key, value in (TEACHER | SIMULATED).items()]
+    words += [f"--data.init_args.source.init_args.root={run_dir.parent / 'images'}"]
+    return trained(configs, words, run_dir, *more)
 
 
 def trained(configs, settings, run_dir, *more):
@@ -223,14 +226,49 @@ def trained(configs, settings, run_dir, *more):
     return torch.load(run_dir / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
 
 
-@pytest.mark.parametrize("train", [trained_teacher, trained_with_classes])
+@pytest.mark.parametrize("train", [trained_teacher, trained_with_classes, trained_judge])
 def test_the_point_teacher_trains_resumes_exactly_and_gives_a_source(train, smoke_root, tmp_path):
     whole = train(smoke_root, tmp_path / "whole")
     middle = tmp_path / "whole" / "checkpoints" / "step=0000001.ckpt"
     resumed = train(smoke_root, tmp_path / "rest", f"--ckpt_path={middle}")
     for key, value in whole.items():
         assert torch.equal(resumed[key], value), key
-    weights = tmp_path / "rest" / "waffleiron_s.safetensors"
-    features = feature_source("waffleiron-s", weights, dim=16)(torch.rand(50, 4) * 10)
+    (weights,) = (tmp_path / "rest").glob("*.safetensors")
+    name = weights.stem.replace("_", "-")
+    features = feature_source(name, weights, dim=16)(torch.rand(50, 4) * 10)
     assert features.shape == (50, 16)
     assert torch.allclose(features.norm(dim=1), torch.ones(50), atol=1e-5)
+    with safe_open(weights, "pt") as file:
+        kinds = {file.get_tensor(key).dtype for key in file.keys()} - {torch.int64}  # noqa: SIM118
+    assert kinds == {torch.float16 if train is trained_with_classes else torch.float32}
+
+
+def test_one_command_simulates_then_adds_scans_and_the_grids_of_a_teacher(tmp_path, capsys):
+    """The images of conf/r3dpa_s_2 are also what its teacher is trained on."""
+    data, labelled, teacher = (
+        CONF / name
+        for name in ("r3dpa_s_2/data.yaml", "data/labelled_points.yaml", "r3dpa_s_2/teacher.yaml")
+    )
+    given, source = (
+        yaml.safe_load(path.read_text())["data"]["init_args"] for path in (data, labelled)
+    )
+    source = source["source"]["init_args"]
+    assert {key: given[key] for key in source} == source
+    words = ["data", "prepare", f"--config={data}", f"--data.init_args.root={tmp_path}"]
+    words += [
+        "--data.init_args.sensor={beams: 16, columns: 64}",
+        "--data.init_args.grid_size=[2, 8]",
+    ]
+    main([*words, "--data.init_args.num_scans=2"])
+    assert "1 scans to train, 1 held out; no feature grids" in capsys.readouterr().out
+    words.append("--data.init_args.num_scans=3")
+    weights = feature_source("waffleiron-s").shipped
+    extractor = f"--data.init_args.extractor.init_args.weights={weights}"
+    main([*words, f"--config={teacher}", extractor])
+    grids = tmp_path / "feature_grids" / "waffleiron-s-2"
+    assert f"2 scans to train, 1 held out; feature grids: {grids}" in capsys.readouterr().out
+    counts = [
+        sum(len(path.read_text().splitlines()) for path in folder.glob("*.jsonl"))
+        for folder in (*tmp_path.glob("labelled_image_*"), grids / "2x8")
+    ]
+    assert counts == [3, 3]

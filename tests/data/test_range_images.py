@@ -2,9 +2,11 @@ from __future__ import annotations
 
 import pytest
 import torch
+from torch import nn
 
 from lidarsim import Simulator
-from r3dpa.data import SimulatedDataModule, SimulatedImageDataModule
+from r3dpa.data import LabelledPointDataModule, SimulatedDataModule, SimulatedImageDataModule
+from r3dpa.features import Masking, ScanGrid
 from r3dpa.geometry import (
     NUM_CLASSES,
     LidarSensor,
@@ -102,3 +104,64 @@ def test_cached_images_and_files_of_the_same_scans_agree(tmp_path):
     read, cached = (sample["range_image"] for sample in samples)
     torch.testing.assert_close(cached, read, rtol=0, atol=2e-4)
     assert torch.equal(cached[3], read[3])
+
+
+class _Intensities(nn.Module):
+    """Extractor whose features are range and intensity."""
+
+    def __init__(self):
+        super().__init__()
+        self.name, self.dim, self.settings = "intensities", 2, {}
+
+    @staticmethod
+    def prepare(points):
+        return torch.stack([points[:, :3].norm(dim=1), points[:, 3]], dim=1)
+
+    def point_features(self, prepared):
+        return list(prepared)
+
+
+def test_grids_of_labelled_images_are_made_of_their_pixels_without_simulating(
+    tmp_path, monkeypatch
+):
+    module(tmp_path, codec=LABELLED, num_scans=4).prepare_data()
+    monkeypatch.delattr(Simulator, "scan")
+    data = module(tmp_path, codec=LABELLED, num_scans=4, extractor=_Intensities())
+    data.prepare_data()
+    data.setup("fit")
+    for index, item in enumerate(data.train_set.scans):
+        pixels = data.images.read(item)
+        filled = (pixels.range_m > 0).unflatten(0, (4, 4)).unflatten(2, (8, 8))
+        count = filled.sum(dim=(1, 3)).flatten()
+        grid = data.train_set[index]["feature_grid"]
+        for channel, values in enumerate((pixels.range_m, pixels.intensity)):
+            blocks = values.unflatten(0, (4, 4)).unflatten(2, (8, 8))
+            sums = torch.where(filled, blocks, 0.0).sum(dim=(1, 3)).flatten()
+            expected = sums / count.clamp(min=1)
+            torch.testing.assert_close(grid[:, channel], expected, rtol=2e-3, atol=1e-3)
+
+
+def test_points_and_classes_of_a_labelled_image_train_a_network_on_points(tmp_path):
+    source = module(tmp_path, codec=LABELLED, num_scans=2)
+    grid = ScanGrid((-57.6, -57.6, -4.8), (57.6, 57.6, 7.2), 2.4, 0.01, 4)  # keeps all points
+    data = LabelledPointDataModule(source, Masking(grid))
+    data.prepare_data()
+    data.setup("fit")
+    masked = data.train_set[(0, 0)]
+    pixels = source.images.read(data.train_set.scans[0])
+    seen = pixels.range_m > 0
+    kept = masked.scan.kept
+    assert torch.equal(masked.classes, pixels.classes[seen][kept])
+    # A rotation keeps ranges.
+    torch.testing.assert_close(masked.scan.features[:, 4], pixels.range_m[seen][kept])
+    mean, std = grid.intensity_mean, grid.intensity_std
+    torch.testing.assert_close(
+        masked.scan.features[:, 0] * std + mean, pixels.intensity[seen][kept]
+    )
+
+
+def test_networks_on_points_need_images_with_intensity(tmp_path):
+    data = LabelledPointDataModule(module(tmp_path, num_scans=2), Masking())
+    data.prepare_data()
+    with pytest.raises(ValueError, match="intensity_channel to true"):
+        data.setup("fit")

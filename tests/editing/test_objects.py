@@ -1,4 +1,5 @@
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from lidarsim import Semantic
 from r3dpa.data import Scan, ScanError, write_bin
 from r3dpa.data.labels import CLASS_NAMES, read_labels
 from r3dpa.editing.objects import ObjectClass, ObjectLibrary, object_library
-from r3dpa.geometry import LidarSensor, RingProjection, SphericalProjection
+from r3dpa.geometry import LidarSensor, Pixels, RingProjection, SphericalProjection
 
 CAR, ROAD = 26, 7
 SENSOR = LidarSensor(beams=4, columns=8, inclination_max_deg=20, inclination_min_deg=-20)
@@ -61,6 +62,30 @@ def library(tmp_path, scaled_points):
     labels = [CAR | 1 << 16, CAR, CAR, ROAD, CAR | 2 << 16, CAR, 0]
     scans = [write_scan(tmp_path, "0", points, labels)]
     return object_library(scans, scaled_points(gain=2.0), PROJECTION, (2, 4))
+
+
+class _Images:
+    """One image: cars in the front half, road in the back half."""
+
+    def read(self, scan):
+        classes = torch.full((4, 8), 11)
+        classes[:, :2] = classes[:, 6:] = 0
+        return Pixels(torch.full((4, 8), 10.0), torch.full((4, 8), 0.5), classes)
+
+
+def test_a_library_of_cached_images_is_of_the_points_at_their_pixels(scaled_points):
+    scan = Scan("drive", "0", Path("no file"))
+    library = object_library([scan], scaled_points(), PROJECTION, (2, 4), _Images())
+    assert library.names == ("road", "car")
+    road, car = library.feature("road"), library.feature("car")
+    assert (car[0] > 0) & (road[0] < 0)  # ahead and behind
+    assert car[3].item() == road[3].item() == 0.5
+    assert [entry.num_points for entry in library.classes] == [16, 16]
+
+
+def test_everyday_names_of_classes_are_known(library):
+    with pytest.raises(ValueError, match="unknown class 'person'; choose from road, car"):
+        library.feature("pedestrian")
 
 
 def test_a_cell_counts_by_the_share_of_its_points_that_are_of_the_class(library):

@@ -213,3 +213,14 @@ def test_no_point_learns_anything_of_a_hidden_one(network):
     assert not torch.allclose(network.mix(changed, batch)[visible], mixed[visible], atol=1e-2)
     others = torch.where(visible[:, None], torch.randn_like(tokens), tokens)
     assert not torch.allclose(network.mix(others, batch, visible)[~visible], mixed[~visible])
+
+
+def test_training_and_evaluation_have_the_same_offset_layer_and_gradient(network):
+    layer, offsets = network.embedding.offset[1], torch.randn(40, 5)
+    outputs, gradients = [], []
+    for training in (True, False):
+        layer.train(training)
+        outputs.append(layer(offsets))
+        gradients.append(torch.autograd.grad(outputs[-1].square().sum(), layer.weight)[0])
+    torch.testing.assert_close(*outputs)
+    torch.testing.assert_close(*gradients)

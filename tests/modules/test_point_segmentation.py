@@ -73,11 +73,12 @@ def test_training_learns_classes_and_goes_on_from_its_weights(tmp_path, data):
     trainer = Trainer(max_steps=40, num_sanity_val_steps=0, default_root_dir=tmp_path, **SILENT)
     trainer.fit(module, data)
     assert trainer.callback_metrics["train/classes"] < 0.5  # 0.69 for a guess of two classes
-    file = tmp_path / "waffleiron_s.safetensors"
+    file = tmp_path / "waffleiron_s_2.safetensors"
     further = PointSegmentation(WaffleIron(16, 3, GRID.cells), start=file)
     for key, value in module.network.state_dict().items():
-        assert torch.equal(further.network.state_dict()[key], value), key
-    assert torch.equal(further.norm.running_mean, module.norm.running_mean)
+        rounded = value.half().to(value.dtype)  # the file is in half precision
+        assert torch.equal(further.network.state_dict()[key], rounded), key
+    assert torch.equal(further.norm.running_mean, module.norm.running_mean.half().float())
     assert WaffleIronS(file, dim=16)(cloud(9)).isfinite().all()
 
 

@@ -31,6 +31,7 @@ COMMANDS = {
     "data check": Command("data:check", "list bad scans and missing folders of a data set"),
     "data convert": Command("lidarsim.conversion:convert", "write scans in another format"),
     "data view": Command("data:view", "draw scans: pictures and a page with point clouds"),
+    "data prepare": Command("fit:prepare", "simulate the scans of a data YAML", resumable=True),
     "data features": Command("fit:features", "write feature grids of scans", resumable=True),
     "data objects": Command("data:objects", "write mean features of object classes for inpaint"),
     "data sensors": Command("sensors:sensors", "list sensor presets"),
@@ -57,7 +58,7 @@ COMMANDS = {
     "bench training": Command("bench:training", "measure time and memory of training steps"),
     "completion": Command("completion:completion", "print a script that completes in bash"),
 }
-OWN_PARSER = ("fit:run", "fit:features")
+OWN_PARSER = ("fit:run", "fit:features", "fit:prepare")
 # Commands of `data` and `edit` are known by their own name, too: `r3dpa view` is `r3dpa data view`.
 ALIASES = {
     name.split()[1]: name

@@ -43,7 +43,8 @@ def completion(shell: Literal["bash"]) -> str:
             cases.append(_case(f'"{name} "*', _STAGE))
             continue
         patterns = [name, short_names[name]] if name in short_names else [name]
-        options = _FEATURES if name == "data features" else _options_of(command.target)
+        parsed = {"data features": _FEATURES, "data prepare": "--config --data"}.get(name)
+        options = parsed or _options_of(command.target)
         cases.append(_case("|".join(f'"{pattern} "*' for pattern in patterns), options))
     for group in GROUPS:
         members = [name.removeprefix(group).strip() for name in COMMANDS if name.startswith(group)]

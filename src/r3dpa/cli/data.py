@@ -9,7 +9,7 @@ from typing import Any
 from jsonargparse.typing import PositiveInt
 
 from r3dpa.cli.parser import check_file, check_folder
-from r3dpa.pretrained import DEFAULT_WEIGHTS, check_features
+from r3dpa.pretrained import DEFAULT_WEIGHTS, OBJECTS_SUFFIX, check_features
 
 
 def check(folder: Path, *, columns: tuple[str, ...] = ()) -> None:
@@ -107,20 +107,22 @@ def objects(
 
     Args:
         data: Folder, file or glob of scans with labels beside them: of ``r3dpa data simulate``,
-            KITTI-360 or SemanticKITTI.
+            KITTI-360 or SemanticKITTI; or a data YAML of simulated images with classes.
         ckpt: Checkpoint to edit with; its feature source, sensor and grid are used.
-        out: File to write, ``.safetensors``.
+        out: File to write, ``.safetensors``, or ``.objects`` beside the weights of that name,
+            where ``r3dpa edit inpaint --object`` finds it.
         features_ckpt: Weights of the feature source, if it has none of its own.
         limit: Maximum number of scans, evenly spaced.
         device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
     """
     check_file(out)
-    if out.suffix != ".safetensors":
-        raise ValueError(f"--out must be a .safetensors file, got {out}")
+    if out.suffix not in (".safetensors", OBJECTS_SUFFIX):
+        raise ValueError(f"--out must be a .safetensors or {OBJECTS_SUFFIX} file, got {out}")
     check_features(ckpt)
     from tqdm import tqdm
 
     from r3dpa.checkpoints import read_checkpoint
+    from r3dpa.cli.features import read_data
     from r3dpa.cli.scene_files import feature_source_of
     from r3dpa.data import find_scans
     from r3dpa.data.scans import evenly
@@ -134,9 +136,15 @@ def objects(
     projection, sit = generator.geometry.projection, generator.sit
     extractor: Any = feature_source(source, features_ckpt, sit.feature_dim)
     extractor = extractor.to(usable_device(device))
-    scans = evenly(find_scans(data), limit)
+    images = None
+    if data.endswith((".yaml", ".yml")):
+        module = read_data(Path(data))
+        scans, images = module.limited_split()[0], module.images
+    else:
+        scans = find_scans(data)
+    scans = evenly(scans, limit)
     shown = tqdm(scans, unit="scan", desc="objects", disable=None)
-    library = object_library(iter(shown), extractor, projection, sit.grid_size)
+    library = object_library(iter(shown), extractor, projection, sit.grid_size, images)
     library.save(out)
     rows = [
         [

@@ -9,7 +9,7 @@ from typing import Any
 from jsonargparse.typing import PositiveInt
 
 from r3dpa.cli.parser import EditOptions
-from r3dpa.pretrained import check_features
+from r3dpa.pretrained import check_features, objects_file
 
 
 def inpaint(
@@ -30,16 +30,18 @@ def inpaint(
     """Generate a part of a scan anew, as an object if one is named.
 
     The part is one of --box, --box3d and --mask; pixels outside it keep the scan's values. The
-    object is a class of a library (--objects FILE --object car); without one the edit is unguided.
-    Azimuth 0 looks forward and grows to the left; 180 is behind.
+    object is a class of the mean features beside the weights, such as car, pedestrian, tree or
+    pole, or of a file (--objects FILE --object car); without one the edit is unguided. Azimuth 0
+    looks forward and grows to the left; 180 is behind.
 
     Args:
         scan: Scan to edit: ``.bin``, ``.ply``, or ``.npz`` of one scan.
         box: Azimuth from and to (leftwards), inclination from and to: degrees, ``-10 10 -20 0``.
         box3d: Centre x y z, length, width, height (metres, frame of the sensor), yaw (degrees).
         mask: Picture of H x W pixels as the range image, bright where it is to change.
-        objects: File of ``r3dpa data objects``, made with the feature source of the checkpoint.
-        object: Class of that file.
+        objects: File of ``r3dpa data objects``, made with the feature source of the checkpoint;
+            default: the one beside the weights.
+        object: Class of object.
         strength: Guidance relative to the velocity, 0 to 1; default: 0.5.
         window: First and last guided time; 0 data, 1 noise; default: all.
         start: First time of the edit; below 1 keeps some of the original part.
@@ -61,14 +63,14 @@ def inpaint(
     }
     if sum(region is not None for region in (box, box3d, mask)) != 1:
         raise ValueError("give one of --box, --box3d and --mask: the part that is to change")
-    if (objects is None) != (object is None):
-        raise ValueError(
-            "--objects FILE and --object NAME go together; `r3dpa data objects` writes one"
-        )
-    if objects is None and (strength, window) != (None, None):
+    if object is None and objects is not None:
+        raise ValueError("--objects FILE needs --object NAME, a class of the file")
+    if object is None and (strength, window) != (None, None):
         raise ValueError("--strength and --window need --object")
-    if objects is not None:
-        check_features(EditOptions(**options).ckpt)
+    if object is not None:
+        ckpt = EditOptions(**options).ckpt
+        check_features(ckpt)
+        arguments["objects"] = objects = objects or objects_file(ckpt)
     from r3dpa.cli.edit_session import EditSession
     from r3dpa.cli.scene_files import feature_source_of
     from r3dpa.editing import regions
@@ -83,7 +85,7 @@ def inpaint(
     elif box3d is not None:
         region = regions.box3d(session.projection, box3d[:3], box3d[3:6], box3d[6])
     feature = None
-    if objects is not None and object is not None:
+    if object is not None and objects is not None:
         library = ObjectLibrary.load(objects)
         library.check_source(feature_source_of(session.checkpoint), session.sit.feature_dim)
         feature = library.feature(object)

@@ -1,4 +1,7 @@
-"""``r3dpa data features``: the feature grids of a data set, on one machine or many."""
+"""``r3dpa data features``: the feature grids of a data set, on one machine or many.
+
+``r3dpa data prepare``: whatever a data YAML needs before a training.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +18,7 @@ from r3dpa.cli.presets import shipped
 from r3dpa.cli.stages import StageParser, ignore_harmless_notices
 from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.data.feature_grids import features_lock, plan
+from r3dpa.data.range_images import SimulatedImageDataModule
 from r3dpa.data.scans import Scan
 from r3dpa.features.scalr import SOURCES, feature_source
 from r3dpa.geometry import Projection
@@ -40,7 +44,29 @@ def features(args: list[str]) -> None:
             f"no feature extractor: give --extractor, one of {', '.join(SOURCES)}, or one in the "
             "data configuration (--data.init_args.extractor)"
         )
+    if isinstance(data, SimulatedImageDataModule):
+        raise ValueError("the images of this data are cached without their scans: use data prepare")
     _extract(data, trainer, config.grid_sizes or [data.grid_size])
+
+
+def prepare(args: list[str]) -> None:
+    """Run ``data prepare``, given its name and the words after it."""
+    ignore_harmless_notices()
+    parser = StageParser(
+        prog="r3dpa data prepare",
+        description="Simulate the scans of a data YAML that are missing, and make the feature "
+        "grids of its extractor, as a training does before its first step. The same command "
+        "completes an interrupted one; a larger number of scans adds what an earlier one lacks.",
+    )
+    parser.add_argument("--config", action="config", help="data YAML; later ones win")
+    parser.add_lightning_class_args(LidarDataModule, "data", subclass_mode=True)
+    data: LidarDataModule = parser.instantiate(parser.parse_args(args[1:])).data
+    data.prepare_data()
+    train, val = data.limited_split()
+    grids = (
+        "no feature grids" if data.features_dir is None else f"feature grids: {data.features_dir}"
+    )
+    sys.stdout.write(f"{len(train)} scans to train, {len(val)} held out; {grids}\n")
 
 
 def _extract(data: LidarDataModule, trainer: Trainer, sizes: list[tuple[int, int]]) -> None:

@@ -84,6 +84,13 @@ def features(args: list[str]) -> None:
     write_features(args)
 
 
+def prepare(args: list[str]) -> None:
+    """Run ``data prepare``, given its name and the words after it."""
+    from r3dpa.cli.features import prepare as prepare_data
+
+    prepare_data(args)
+
+
 def _names_stage(words: list[str]) -> bool:
     """Whether the words start with a stage, or give a configuration or a model."""
     if words and not words[0].startswith("-"):

@@ -396,10 +396,12 @@ class SimulatedDataModule(LidarDataModule):
 class PointDataModule(LoaderModule):
     """Points of the scans of another data module, prepared at random in each epoch.
 
-    Batches are lists of what ``prepare`` returns; no range images or feature grids are made.
+    Batches are lists of what ``prepare`` returns; no feature grids are made.
 
     Args:
         source: Scans and their split, simulated where it does that. Give it ``extractor: null``.
+            Where it caches images, points lie at the centres of pixels, and its codec must have a
+            channel of intensity.
         prepare: Function of the points ``(P, 4)`` and a generator, such as
             ``r3dpa.features.Masking``.
         batch_size: Scans per batch and process.
@@ -407,6 +409,8 @@ class PointDataModule(LoaderModule):
         seed: Seed of order and draws.
         weather: Weather of training scans, drawn anew in each epoch; none by default.
     """
+
+    points_class = DrawnPoints
 
     def __init__(
         self,
@@ -431,8 +435,16 @@ class PointDataModule(LoaderModule):
 
     def setup(self, stage: str) -> None:
         """Index the scans."""
+        images = self.source.images
+        if images is not None and not self.source.codec.intensity_channel:
+            raise ValueError(
+                "--data.init_args.source caches ranges alone, and a network on points reads "
+                "intensities: set source.init_args.codec.intensity_channel to true"
+            )
         self.train_set, self.val_set = (
-            DrawnPoints(scans, self.source.sensor, self.prepare, self.seed, self.weather_prior)
+            self.points_class(
+                scans, self.source.sensor, self.prepare, self.seed, self.weather_prior, images
+            )
             for scans in self.source.limited_split()
         )
 
@@ -452,12 +464,15 @@ class LabelledPointDataModule(PointDataModule):
 
     Args:
         source: Scans and their split, with or without label files, see
-            :func:`r3dpa.data.labels.read_labels`. Give it ``extractor: null``.
+            :func:`r3dpa.data.labels.read_labels`, or with classes in its cached images. Give it
+            ``extractor: null``.
         prepare: An ``r3dpa.features.Masking``.
         batch_size: Scans per batch and process.
         num_workers: Loader processes per training process.
         seed: Seed of order and draws.
     """
+
+    points_class = LabelledPoints
 
     def __init__(
         self,
@@ -468,10 +483,3 @@ class LabelledPointDataModule(PointDataModule):
         seed: int = 0,
     ) -> None:
         super().__init__(source, prepare, batch_size, num_workers, seed)
-
-    def setup(self, stage: str) -> None:
-        """Index the scans."""
-        self.train_set, self.val_set = (
-            LabelledPoints(scans, self.source.sensor, self.prepare, self.seed)
-            for scans in self.source.limited_split()
-        )

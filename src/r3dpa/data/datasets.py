@@ -23,9 +23,12 @@ from r3dpa.geometry import (
     Pixels,
     Projection,
     RangeCodec,
+    SphericalProjection,
     in_range,
+    points_of,
     project_pixels,
     range_image,
+    values_at_returns,
 )
 from r3dpa.geometry.semantics import UNKNOWN_CLASS, classes_of
 
@@ -161,15 +164,20 @@ class DrawnPoints(PointDataset):
     """Random preparation of points, ``prepare(points, generator)``.
 
     An item ``(epoch, index)``, or ``index`` of epoch 0, is a function of these and ``seed`` alone.
-    ``weather`` changes the points of an item of an epoch.
+    ``weather`` changes the points of an item of an epoch. Where ``images`` are given, the points
+    lie at the centres of their pixels.
     """
 
     seed: int
     weather: WeatherPrior | None = None
+    images: CachedImages | None = None
 
     def __getitem__(self, key: tuple[int, int] | int) -> Any:
         epoch, index = key if isinstance(key, tuple) else (0, key)
-        read = read_scan(self.scans[index].path, self.sensor)
+        if self.images is None:
+            read = read_scan(self.scans[index].path, self.sensor)
+        else:
+            read = points_at_pixels(self.images.read(self.scans[index]), self.sensor).numpy()
         if self.weather is not None and isinstance(key, tuple):
             read = self.weather.points(read, (self.seed, epoch, index))
             if not in_range(torch.from_numpy(read[:, :3]), self.sensor).any():
@@ -183,14 +191,32 @@ class LabelledPoints(DrawnPoints):
 
     def __getitem__(self, key: tuple[int, int] | int) -> Any:
         masked: MaskedScan = super().__getitem__(key)
-        path = self.scans[key[1] if isinstance(key, tuple) else key].path
-        labels = find_labels(path, len(masked.scan.upsample))
-        if labels is None:
+        scan = self.scans[key[1] if isinstance(key, tuple) else key]
+        classes = self._classes(scan, len(masked.scan.upsample))
+        if classes is None:
             unknown = torch.full((len(masked.hidden),), UNKNOWN_CLASS)
             return masked._replace(classes=unknown)
+        return masked._replace(classes=classes[masked.scan.kept])
+
+    def _classes(self, scan: Scan, num_points: int) -> Tensor | None:
+        """Classes ``(P,)`` of all points of a scan; None for a scan without labels."""
+        if self.images is not None:
+            pixels = self.images.read(scan)
+            if pixels.classes is None:
+                return None
+            projection = SphericalProjection(self.sensor)
+            return values_at_returns(pixels.classes, pixels.range_m, projection)
+        labels = find_labels(scan.path, num_points)
         # The upper bits of a label are the object.
-        kept = torch.from_numpy(labels & 0xFFFF)[masked.scan.kept]
-        return masked._replace(classes=classes_of(kept))
+        return None if labels is None else classes_of(torch.from_numpy(labels & 0xFFFF))
+
+
+def points_at_pixels(pixels: Pixels, sensor: LidarSensor) -> Tensor:
+    """Points ``(P, 4)`` at the centres of the pixels with a return; intensity 0 if not known."""
+    intensity = pixels.intensity
+    if intensity is None:
+        intensity = torch.zeros_like(pixels.range_m)
+    return points_of(pixels.range_m, SphericalProjection(sensor), intensity=intensity)
 
 
 def _lost_in_weather(path: Path, sensor: LidarSensor) -> ScanError:

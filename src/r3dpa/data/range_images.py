@@ -20,13 +20,14 @@ from tqdm import tqdm
 from lidarsim import SIMULATOR_VERSION, TRAIN_DRIVES, VAL_DRIVES, Simulator, split_scans
 from lidarsim.scene import Conditions
 from r3dpa.data.datamodules import LidarDataModule
-from r3dpa.data.datasets import PointSample
+from r3dpa.data.datasets import PointSample, points_at_pixels
 from r3dpa.data.feature_grids import Extractor, GridSettings, pooled_grids
 from r3dpa.data.loaders import at_least, plain_loader
 from r3dpa.data.pixel_codes import decode_pixels, encode_pixels
 from r3dpa.data.store import CachedTensors, ItemKey, Store, tensor_cache
 from r3dpa.geometry import (
     SEMANTIC_CLASSES,
+    LidarSensor,
     Pixels,
     Projection,
     SphericalProjection,
@@ -81,8 +82,10 @@ class SimulatedImageDataModule(LidarDataModule):
     """Simulated streets whose range images are cached in float16, 131 kB each; points are dropped.
 
     Images are made before the first use, and so are feature grids if there is an extractor: only
-    those that are missing. Ranges are rounded to 11 bits, 1 cm at 20 m. Where the codec has
-    channels of intensity or class, both are cached beside the range: 197 kB each.
+    what is missing, eight scans between two writes. A larger ``num_scans`` adds to the images of an
+    earlier run. Ranges are rounded to 11 bits, 1 cm at 20 m. Where the codec has channels of
+    intensity or class, both are cached beside the range, 197 kB each; feature grids are then made
+    of the points of the pixels, so that an extractor that comes later needs no simulation.
 
     Args:
         root: Folder of the caches.
@@ -145,10 +148,13 @@ class SimulatedImageDataModule(LidarDataModule):
             grids = settings.store(self.features_dir)
         with only_writer(Path(self.root) / ".lock", f"simulates into {self.root}", wait=True):
             missing = set(self._store.missing(images))
-            if grids is not None:
+            if grids is not None and not self._with_values:
                 missing |= set(grids.missing(images))
             if missing:
-                self._simulate(sorted(missing), projection, grids)
+                made_with = None if self._with_values else grids
+                self._simulate(sorted(missing), projection, made_with)
+            if grids is not None and self._with_values:
+                self._write_grids(grids, grids.missing(images))
 
     @cached_property
     def images(self) -> CachedPixels:
@@ -213,6 +219,39 @@ class SimulatedImageDataModule(LidarDataModule):
                 if grid_writer is not None:
                     pooled = pooled_grids(extractor, samples, projection, [self.grid_size])
                     grid_writer.add(keys, pooled[self.grid_size])
+
+    def _write_grids(self, grids: Store, missing: Sequence[SimulatedImage]) -> None:
+        """Make the feature grids of cached images."""
+        if not missing:
+            return
+        rank_zero_info(f"making {len(missing)} feature grids in {grids.folder}")
+        extractor = cast(Extractor, self.extractor)
+        images = CachedPixels(CachedTensors(self._store, missing), self.sensor.range_max_m)
+        dataset = _CachedPoints(missing, images, self.sensor, extractor.prepare)
+        loader = plain_loader(dataset, 1, self.num_workers, collate_fn=list)
+        projection = SphericalProjection(self.sensor)
+        with grids.writer() as writer:
+            for samples in tqdm(loader, desc="feature grids", unit="scan", disable=None):
+                pooled = pooled_grids(extractor, samples, projection, [self.grid_size])
+                writer.add([sample.key for sample in samples], pooled[self.grid_size])
+
+
+@dataclass(eq=False, repr=False)
+class _CachedPoints(Dataset[PointSample]):
+    """Points of the pixels of cached images, prepared for an extractor."""
+
+    items: Sequence[SimulatedImage]
+    images: CachedPixels
+    sensor: LidarSensor
+    prepare: Callable[..., Any]
+
+    def __len__(self) -> int:
+        return len(self.items)
+
+    def __getitem__(self, index: int) -> PointSample:
+        item = self.items[index]
+        points = points_at_pixels(self.images.read(item), self.sensor)
+        return PointSample(cast(Any, item), item.cache_key, points, self.prepare(points))
 
 
 @dataclass(eq=False, repr=False)

@@ -18,14 +18,24 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from lidarsim.scan_files import read_scan
+from r3dpa.data.datasets import CachedImages, points_at_pixels
 from r3dpa.data.feature_grids import Extractor
 from r3dpa.data.labels import CLASS_NAMES, read_labels
 from r3dpa.data.scans import Scan
-from r3dpa.geometry import Projection, in_range, projection_to_dict
+from r3dpa.geometry import (
+    LidarSensor,
+    Projection,
+    SphericalProjection,
+    in_range,
+    labels_of,
+    projection_to_dict,
+    values_at_returns,
+)
 from r3dpa.io import UNPICKLING_ERRORS, atomic_path, first_line, json_values
 
 _CARD = "r3dpa_objects"
 _VERSION = 1
+_OTHER_NAMES = {"pedestrian": "person", "tree": "vegetation"}
 
 
 @dataclass(frozen=True)
@@ -75,11 +85,12 @@ class ObjectLibrary:
         return str(self.extractor["name"])
 
     def feature(self, name: str) -> Tensor:
-        """Mean feature ``(D,)`` of a class.
+        """Mean feature ``(D,)`` of a class; ``pedestrian`` is a person, ``tree`` vegetation.
 
         Raises:
-            ValueError: If the library lacks the class; the message lists those that it has.
+            ValueError: If the library lacks the class; the message lists the classes that it has.
         """
+        name = _OTHER_NAMES.get(name, name)
         if name not in self.names:
             raise ValueError(f"unknown class {name!r}; choose from {', '.join(self.names)}")
         return self.features[self.names.index(name)]
@@ -170,6 +181,7 @@ def object_library(
     extractor: Extractor,
     projection: Projection,
     grid_size: tuple[int, int] = (8, 64),
+    images: CachedImages | None = None,
 ) -> ObjectLibrary:
     """Mean feature of each class, by id, over the cells of labelled scans.
 
@@ -188,6 +200,7 @@ def object_library(
         extractor: Feature source of the library.
         projection: Projection whose pixels the cells consist of.
         grid_size: Rows and columns (h, w) of the cells.
+        images: Cached images of the scans, whose pixels are the points; default: the scan files.
 
     Raises:
         ScanError: If a scan or its labels cannot be used.
@@ -195,8 +208,7 @@ def object_library(
     """
     sums: dict[str, _ClassSums] = {}
     for scan in scans:
-        points = torch.from_numpy(read_scan(scan.path, projection.sensor))
-        labels = torch.from_numpy(read_labels(scan.path, len(points))) & 0xFFFF
+        points, labels = _labelled_points(scan, projection.sensor, images)
         cells = _cells_of_classes(points, labels, extractor, projection, grid_size)
         for name, shares, features, num_points in cells:
             if not features.isfinite().all():
@@ -215,6 +227,20 @@ def object_library(
         projection_to_dict(projection),
         (grid_size[0], grid_size[1]),
     )
+
+
+def _labelled_points(
+    scan: Scan, sensor: LidarSensor, images: CachedImages | None
+) -> tuple[Tensor, Tensor]:
+    """Points ``(P, 4)`` of a scan, and KITTI-360 class ids ``(P,)``."""
+    if images is None:
+        points = torch.from_numpy(read_scan(scan.path, sensor))
+        return points, torch.from_numpy(read_labels(scan.path, len(points))) & 0xFFFF
+    pixels = images.read(scan)
+    if pixels.classes is None:
+        raise ValueError("the cached images have no classes: set codec.num_classes of the data")
+    classes = values_at_returns(pixels.classes, pixels.range_m, SphericalProjection(sensor))
+    return points_at_pixels(pixels, sensor), labels_of(classes)
 
 
 def _cells_of_classes(

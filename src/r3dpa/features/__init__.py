@@ -2,7 +2,7 @@
 
 from r3dpa.features.dinov2 import DINOv2
 from r3dpa.features.geometric import GeometricFeatures
-from r3dpa.features.scalr import SOURCES, ScaLR, WaffleIronS, feature_source
+from r3dpa.features.scalr import SOURCES, ScaLR, WaffleIronS, WaffleIronS2, feature_source
 from r3dpa.features.voxels import (
     Masking,
     PointCloudBatch,
@@ -22,6 +22,7 @@ __all__ = [
     "ScanGrid",
     "WaffleIron",
     "WaffleIronS",
+    "WaffleIronS2",
     "collate_scans",
     "feature_source",
     "prepare_scan",

@@ -36,7 +36,7 @@ from r3dpa.features.waffleiron import WaffleIron
 from r3dpa.io import UNPICKLING_ERRORS, atomic_path, first_line, weights_sha256
 
 #: Names that :func:`feature_source` accepts.
-SOURCES = ("scalr", "waffleiron-s", "geometric")
+SOURCES = ("scalr", "waffleiron-s", "waffleiron-s-2", "geometric")
 
 _RELEASED = "ckpt_last.pth of WI_768-DINOv2_ViT_L_14-NS_KI_PD"
 # Entries with the weights in files of the distillation script and of its successor.
@@ -184,6 +184,10 @@ class WaffleIronS(TokenFeatures):
     shipped = _FOLDER / "waffleiron_s.safetensors"
 
     def __init__(self, weights: Path | None = None, dim: int = 768) -> None:
+        if weights is None and not self.shipped.is_file():
+            raise ValueError(
+                f"no weights of {self.name} are in this package: give its weights file"
+            )
         state, network, grid = read_weights(Path(weights) if weights else self.shipped)
         super().__init__(network, grid)
         if dim < network.width:
@@ -209,10 +213,28 @@ class WaffleIronS(TokenFeatures):
         return values @ self.basis.T
 
 
-def save_weights(path: Path, network: WaffleIron, norm: nn.BatchNorm1d, grid: ScanGrid) -> None:
-    """Write what :class:`WaffleIronS` reads; ``norm`` has the statistics of the tokens."""
+class WaffleIronS2(WaffleIronS):
+    """``waffleiron-s-2``: the same network, trained anew on classes and masked geometry.
+
+    It shares no weights with ``waffleiron-s``, the network behind FWID, so that FWID may judge a
+    generator that was aligned with this one. See :class:`r3dpa.modules.PointSegmentation`.
+    """
+
+    name = "waffleiron-s-2"
+    shipped = _FOLDER / "waffleiron_s_2.safetensors"
+
+
+def save_weights(
+    path: Path, network: WaffleIron, norm: nn.BatchNorm1d, grid: ScanGrid, half: bool = False
+) -> None:
+    """Write what :class:`WaffleIronS` reads; ``norm`` has the statistics of the tokens.
+
+    ``half`` stores floating-point values as float16, in half the bytes.
+    """
     state = {f"network.{key}": value for key, value in network.state_dict().items()}
     state |= {f"norm.{key}": value for key, value in norm.state_dict().items()}
+    if half:
+        state = {k: v.half() if v.is_floating_point() else v for k, v in state.items()}
     state = {key: value.detach().cpu().contiguous() for key, value in state.items()}
     about = {"width": network.width, "depth": network.depth, "grid": asdict(grid)}
     with atomic_path(path) as temporary:
@@ -220,11 +242,12 @@ def save_weights(path: Path, network: WaffleIron, norm: nn.BatchNorm1d, grid: Sc
 
 
 def read_weights(path: Path) -> tuple[dict[str, Tensor], WaffleIron, ScanGrid]:
-    """Content of a file of :func:`save_weights`, with its network rebuilt, and its grid."""
+    """Content of a file of :func:`save_weights` in float32, its network rebuilt, and its grid."""
     try:
         with safe_open(path, framework="pt") as file:
             about = json.loads(file.metadata()[_ABOUT])
             state = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - no dict
+        state = {k: v.float() if v.is_floating_point() else v for k, v in state.items()}
         lists = about["grid"]
         settings: dict[str, Any] = {
             key: tuple(lists[key]) if isinstance(lists[key], list) else lists[key] for key in lists
@@ -247,9 +270,9 @@ def feature_source(name: str, ckpt: str | Path | None = None, dim: int = 768) ->
 
     Args:
         name: ``"scalr"``: distilled from images, needs the released checkpoint;
-            ``"waffleiron-s"``: trained on simulated scans; ``"geometric"``: local shape, without
-            training.
-        ckpt: Weights of ``"scalr"``, or of ``"waffleiron-s"``, which has default weights.
+            ``"waffleiron-s"``: trained on simulated scans, ``"waffleiron-s-2"`` on their classes
+            too; ``"geometric"``: local shape, without training.
+        ckpt: Weights of ``"scalr"``, or of a ``"waffleiron-s"`` in place of the shipped ones.
         dim: Width D of the features; for ``"scalr"``, the width of its checkpoint.
     """
     if name not in SOURCES:
@@ -264,8 +287,9 @@ def feature_source(name: str, ckpt: str | Path | None = None, dim: int = 768) ->
         if scalr.dim != dim:
             raise ValueError(f"{ckpt} has features of width {scalr.dim}, but dim is {dim}")
         return scalr
-    if name == "waffleiron-s":
-        return WaffleIronS(None if ckpt is None else Path(ckpt), dim=dim)
+    if name.startswith("waffleiron-s"):
+        kind = WaffleIronS2 if name == WaffleIronS2.name else WaffleIronS
+        return kind(None if ckpt is None else Path(ckpt), dim=dim)
     if ckpt is not None:
         raise ValueError(f"feature source {name} has no weights: leave ckpt ({ckpt}) out")
     return GeometricFeatures(dim)

@@ -103,7 +103,7 @@ class Embedding(nn.Module):
         self.point = nn.Linear(NUM_FEATURES, width)
         self.offset = nn.Sequential(
             nn.BatchNorm1d(NUM_FEATURES),
-            nn.Linear(NUM_FEATURES, width, bias=False),
+            _ManyRowsLinear(NUM_FEATURES, width, bias=False),
             nn.BatchNorm1d(width),
             nn.ReLU(inplace=True),
         )
@@ -136,6 +136,18 @@ class Embedding(nn.Module):
         with no_autocast(offsets.device):
             hidden = self.offset(offsets)
         return self.neighbor(hidden)  # most of the computation, under autocast
+
+
+class _ManyRowsLinear(nn.Linear):
+    """Linear layer for many rows of few features.
+
+    From a contiguous transpose of the weights, their gradient takes a tenth of the time on a CPU:
+    a fifth of a training step of ``waffleiron-s``.
+    """
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """``(N, in_features)`` to ``(N, out_features)``."""
+        return inputs @ self.weight.T.contiguous() if self.training else super().forward(inputs)
 
 
 class SpatialMixing(nn.Module):

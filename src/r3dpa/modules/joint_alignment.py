@@ -24,7 +24,7 @@ class JointAlignment(GenerativeModule):
     Args:
         vae: Range-image autoencoder.
         sit: Velocity network, :class:`r3dpa.nn.SiT` or :class:`r3dpa.nn.UNet`.
-        discriminator: Patch discriminator.
+        discriminator: Patch discriminator; without it, no adversarial term.
         **kwargs: See :class:`GenerativeModule`; without ``init_from`` training starts from scratch.
     """
 
@@ -32,18 +32,21 @@ class JointAlignment(GenerativeModule):
     default_init = ("vae", "discriminator", "sit", "latent_norm")
 
     def __init__(
-        self, vae: VAE, sit: VelocityNetwork, discriminator: PatchDiscriminator, **kwargs: Any
+        self,
+        vae: VAE,
+        sit: VelocityNetwork,
+        discriminator: PatchDiscriminator | None = None,
+        **kwargs: Any,
     ) -> None:
         super().__init__(vae, sit, discriminator, **kwargs)
         self.sit.projector.requires_grad_(self.weights.sit_alignment != 0)
 
     def trainable(self) -> dict[str, nn.Module]:
-        """All three networks."""
-        return {
-            "vae": self.vae,
-            "discriminator": self.get_submodule("discriminator"),
-            "sit": self.sit,
-        }
+        """All networks."""
+        networks: dict[str, nn.Module] = {"vae": self.vae}
+        if self.discriminator is not None:
+            networks["discriminator"] = self.discriminator
+        return networks | {"sit": self.sit}
 
     def training_step(self, batch: LidarBatch, batch_idx: int) -> Tensor:
         """One step on range images ``(B, C, H, W)`` and feature grids ``(B, N, D)``."""

@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from r3dpa.features import WaffleIron
+from r3dpa.features import WaffleIron, WaffleIronS2
 from r3dpa.features.scalr import read_weights
 from r3dpa.features.voxels import MaskedScan
 from r3dpa.geometry.semantics import NUM_CLASSES, UNKNOWN_CLASS
@@ -32,6 +32,9 @@ class PointSegmentation(PointPretraining):
         weight_decay: Of AdamW, on matrices only.
         warmup: Steps.
     """
+
+    source = WaffleIronS2
+    writes_half = True
 
     def __init__(
         self,
