@@ -6,6 +6,7 @@ import zlib
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 #: Rays that an effect touches: indices ``(M,)``, or ``slice(None)`` for all.
 RayIndex = NDArray[np.int64] | slice
@@ -15,6 +16,14 @@ def generator_for(*key: int | str) -> np.random.Generator:
     """Random generator of a key of numbers (0 or greater) and words."""
     words = [zlib.crc32(part.encode()) if isinstance(part, str) else part for part in key]
     return np.random.Generator(np.random.Philox(np.random.SeedSequence(words)))
+
+
+def smooth_field(
+    shape: tuple[int, int], width: tuple[float, float], generator: np.random.Generator
+) -> NDArray[np.float64]:
+    """Normal field of unit variance over beams and shots, alike within ``width`` of both."""
+    field = gaussian_filter(generator.standard_normal(shape), width, mode="wrap")
+    return field / field.std()
 
 
 class Draws:

@@ -24,7 +24,7 @@ from lidarsim.sweep import Echoes, Effect, Origin, Sweep
 SECOND_RETURN_M = 1.0
 # Powers, in units of the weakest that is detected, below which the intensity is 0 and from which on
 # it is not damped.
-_ZERO_INTENSITY, _FULL_INTENSITY = 6.0, 13.0
+_ZERO_INTENSITY, _FULL_INTENSITY = 4.0, 8.0
 
 
 @dataclass(frozen=True)
@@ -212,7 +212,7 @@ def calibrated_intensity(
     weakest are reported with 0::
 
         intensity = sqrt(power * range^2) * clip(ln(power / a) / ln(b / a), 0, 1)
-        a = 6 min_power        b = 13 min_power
+        a = 4 min_power        b = 8 min_power
 
     with the received ``power`` in m^-2. Source: fitted to the intensities of KITTI's scans by
     range and incidence.

@@ -46,6 +46,7 @@ REFUSED = {
     "retro_reflection": _HERE,
     "laser_calibration": _HERE,
     "lost_shots": _HERE,
+    "weak_patches": _HERE,
 }
 # Instrument effects that every recorded scan has: they run where they are switched on.
 _ON_REQUEST = ("blooming", "range_noise")

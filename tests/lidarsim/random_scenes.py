@@ -31,6 +31,7 @@ INSTRUMENT = {
     "overlap_range_m": (5.0, 5.0, 1e-2, 50.0),
     "threshold_spread": (0.3, 0.3, 0.0, 1e-3, 2.0),
     "lost_share": (1e-3, 1e-3, 0.0, 0.09),
+    "weak_share": (0.06, 0.0, 1e-6, 0.09),
     "return_mode": ("strongest", "strongest", "dual"),
 }
 NOISE = {

@@ -39,7 +39,7 @@ pytestmark = pytest.mark.filterwarnings("error")
 @pytest.fixture(scope="module")
 def scan():
     sensor = load_sensor("hdl64e", shots=520)
-    scene = Street(5, 0, Conditions()).scene(40, sensor.mount_height_m)
+    scene = Street(5, 0, Conditions()).scene(52, sensor.mount_height_m)
     found = simulate_scan(scene, sensor, ("recorded",))
     return RecordedScan(found.points[:, :3].copy(), found.points[:, 3].copy(), labels=found.labels)
 

@@ -13,6 +13,7 @@ effects                                                 called for by
 ``retro_reflection``, ``blooming``                      signs and plates
 ``glass``, ``polished_metal``                           panes and cabins; steel
 ``mixed_pixels``                                        edges within a beam
+``weak_patches``                                        the instrument
 ``fog``, ``rain``, ``snow``                             weather
 ``spray``, ``sun_glare``                                a fast car on a wet road; a low sun
 ``soft_raydrop``, ``detection_limit``, ``lost_shots``   the instrument
@@ -44,6 +45,7 @@ from lidarsim.effects.surface import (
     PolishedMetal,
     RetroReflection,
     SurfaceTexture,
+    WeakPatches,
     WetGround,
     surface_power,
 )
@@ -61,7 +63,7 @@ RAY_EFFECTS: tuple[Effect, ...] = (
 #: measurement.
 ECHO_EFFECTS: tuple[Effect, ...] = (
     *(EgoOcclusion(), DiffuseReflection(), SurfaceTexture(), WetGround(), RetroReflection()),
-    *(Glass(), PolishedMetal(), MixedPixels()),
+    *(Glass(), PolishedMetal(), MixedPixels(), WeakPatches()),
     *(Fog(), Rain(), Snow(), Spray()),
     *(SunGlare(), Blooming(), SoftRaydrop(), DetectionLimit(), LostShots()),
     *(RangeNoise(), LaserCalibration()),

@@ -8,10 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
 from scipy.special import log_ndtr, ndtr
 
-from lidarsim.draws import Draws, RayIndex, generator_for
+from lidarsim.draws import Draws, RayIndex, generator_for, smooth_field
 from lidarsim.raycast import cast, normals
 from lidarsim.scene import Pose, Primitive, Scene
 from lidarsim.sensors.spinning import SpinningLidar
@@ -116,8 +115,7 @@ def _clumps(shape: tuple[int, int]) -> tuple[Floats, Floats]:
     generator = generator_for("clumps", *shape)
     field = np.zeros(shape)
     for width in _CLUMP_RAYS:
-        part = gaussian_filter(generator.standard_normal(shape), width, mode="wrap")
-        field += part / part.std() / math.sqrt(len(_CLUMP_RAYS))
+        field += smooth_field(shape, width, generator) / math.sqrt(len(_CLUMP_RAYS))
     factor = np.exp(_CLUMP_SPREAD * field - _CLUMP_SPREAD**2 / 2) / _mean_of_product()
     shared = _ALIKE * field
     return shared.astype(np.float32).reshape(-1), factor.astype(np.float32).reshape(-1)

@@ -85,7 +85,8 @@ class SpinningLidar:
     overlap_range_m: float = 5.0  # from here on the receiver sees the whole beam
     threshold_spread: float = 0.3  # standard deviation of the logarithm of the threshold
     lost_share: float = 0.001  # of shots at the ground that are lost, see ``effects.instrument``
-    range_sigma_m: float = 0.0075  # range noise of a strong return
+    weak_share: float = 0.0  # of the echoes that are barely detected, see ``effects.surface``
+    range_sigma_m: float = 0.0065  # range noise of a strong return
     weak_range_sigma_m: float = 0.05  # further noise at a signal-to-noise ratio of 1/2
     range_step_m: float = 0.002  # in which ranges are reported; 0 for none
     return_mode: Literal["strongest", "dual"] = "strongest"  # or the two strongest of a shot
@@ -100,8 +101,9 @@ class SpinningLidar:
             self, "be 0 or greater", "divergence_rad", "pulse_s", "threshold_spread",
             "range_sigma_m", "weak_range_sigma_m", "range_step_m",
         )  # fmt: skip
-        if not 0 <= self.lost_share < 0.1:
-            raise ValueError(f"lost_share must lie in [0, 0.1), got {self.lost_share}")
+        for name in ("lost_share", "weak_share"):
+            if not 0 <= getattr(self, name) < 0.1:
+                raise ValueError(f"{name} must lie in [0, 0.1), got {getattr(self, name)}")
         if not 0 <= self.min_range_m < self.max_range_m < math.inf:
             raise ValueError(
                 f"ranges must satisfy 0 <= min_range_m < max_range_m, "

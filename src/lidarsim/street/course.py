@@ -18,7 +18,7 @@ SCAN_PERIOD_S = 0.1
 
 _CAMBER = 0.02
 # Lanes and pavements of German residential streets.
-_LANE_M, _PAVEMENT_M = (2.75, 3.25), (1.6, 3.2)
+_LANE_M, _PAVEMENT_M = (2.75, 3.25), (1.5, 3.0)
 _GUTTER_M = (0.5, 0.9)
 _PARKING_M = 2.1
 # Bins are emptied on one working day of five.
