@@ -32,7 +32,7 @@ _VARIANCE = _SLOPE_SD_RAD**2
 _SMOOTH_PART = (1 - 0.5 * _VARIANCE / (_VARIANCE + 0.33)).astype(np.float32)
 _ROUGH_PART = (0.45 * _VARIANCE / (_VARIANCE + 0.09)).astype(np.float32)
 # Power of a weak patch in units of the detection limit: intensity 0, and rarely lost.
-_WEAK_POWER = 2.0
+_WEAK_POWER = 2.4
 # Beams and shots over which weak patches are alike.
 _PATCH_RAYS = (1.0, 3.5)
 # The coefficient of retroreflection falls with this power of the cosine of incidence.
@@ -122,7 +122,7 @@ class WeakPatches(Effect):
 
     With the normal field g of :func:`smooth_field` over beams and shots::
 
-        power -> min(power, 2 min_power)        where g exceeds its quantile 1 - weak_share
+        power -> min(power, 2.4 min_power)        where g exceeds its quantile 1 - weak_share
 
     except on sheeting.
 
