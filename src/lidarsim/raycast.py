@@ -191,7 +191,7 @@ def _distance(
     if time_s is not None and solids.velocity[index].any():
         start = _relative(start, solids.velocity.T.take(index, axis=1), time_s)
     solid = _solid(solids, index)
-    shape = solids.shape[index] if np.ndim(index) == 0 else solids.shape[index[0]]
+    shape = int(np.ravel(solids.shape[index])[0])
     distance, leave = _crossing(shape, solid, start, towards)
     if solids.slats[index, 0].any():
         meets = _meets_slat(solids, index, solid, start + distance * towards)
@@ -241,12 +241,7 @@ def cast_single(
         to_ground = (np.float32(solids.ground_m) - origin[2]) / direction[2]
         to_ground[(direction[2] >= 0) | (excluded == GROUND)] = np.nan
         _keep_nearer(to_ground, GROUND, nearest, surface)
-        reach_m = nearest.copy()
-        inside = np.flatnonzero(hollow != NO_SURFACE)
-        reach_m[inside] = np.fmin(
-            reach_m[inside], _far_wall(solids, hollow, inside, origin, direction, time_s)
-        )
-        ray, index = _close_pairs(solids, origin, direction, reach_m, time_s, excluded)
+        ray, index = _close_pairs(solids, origin, direction, nearest, time_s, excluded)
         keep = excluded[ray] != index
         ray, index = ray[keep], index[keep]
         velocity = solids.velocity.T.take(index, axis=1)
@@ -259,22 +254,6 @@ def cast_single(
         hit = np.flatnonzero(distance == nearest[ray])[::-1]
         surface[ray[hit]] = index[hit]
     return np.where(surface == NO_SURFACE, np.float32(np.inf), nearest), surface
-
-
-def _far_wall(
-    solids: Solids,
-    hollow: NDArray[np.int32],
-    rays: NDArray[np.int64],
-    origin: Floats,
-    direction: Floats,
-    time_s: Floats,
-) -> Floats:
-    """Upper bounds (K,) of the distance at which rays leave the solids that they are inside of."""
-    index = hollow[rays]
-    velocity = solids.velocity.T.take(index, axis=1)
-    start = _relative(origin.take(rays, axis=1), velocity, time_s[rays])
-    _, leave = surface_distance(solids, index, start, direction.take(rays, axis=1))
-    return leave + np.float32(_SLACK_M)
 
 
 def surface_distance(
