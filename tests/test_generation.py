@@ -43,7 +43,7 @@ from r3dpa.geometry import (
     points_of,
     range_image,
 )
-from r3dpa.nn import VAE, ThinDecoder
+from r3dpa.nn import VAE, LatentNorm, ThinDecoder
 from r3dpa.nn.perturbed_attention import velocity_and_perturbed
 
 SENSOR = LidarSensor(beams=16, columns=64, range_min_m=2.0, range_max_m=40.0)
@@ -471,6 +471,14 @@ def test_a_checkpoint_is_sampled_with_the_weights_asked_for(checkpoint, weights)
 def test_checkpoints_that_cannot_be_sampled_are_refused(checkpoint, change, message):
     with pytest.raises(ValueError, match=message):
         SceneGenerator.from_checkpoint(replace(read_checkpoint(checkpoint), **change))
+
+
+@pytest.mark.numerics("statistics before any update")
+def test_latent_statistics_without_an_update_are_refused():
+    """A batch norm without a batch hands latents on as they are."""
+    vae, sit, _ = tiny_networks()
+    with pytest.raises(ValueError, match=r"never fitted.*joint or flow_matching"):
+        SceneGenerator(vae, sit, LatentNorm(4), GEOMETRY)
 
 
 def test_vae_of_a_checkpoint_encodes_and_decodes_a_scan(checkpoint):

@@ -2,10 +2,13 @@ import math
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from r3dpa.geometry import (
     EMPTY_RANGE_M,
     LidarSensor,
+    RingProjection,
     SphericalProjection,
     in_range,
     points_of,
@@ -319,3 +322,65 @@ def test_pooling_does_not_depend_on_threads():
         torch.set_num_threads(before)
     assert torch.equal(results[0], results[1])
     assert torch.equal(results[0], results[2])
+
+
+exhaustive = settings(derandomize=True, max_examples=25, deadline=None)
+
+
+@pytest.mark.numerics("rows of equal pitch and real beams")
+def test_nominal_beams_leave_rows_of_equal_pitch_empty():
+    """HDL-64E: 32 beams of 1/3 degree pitch from +2 down, 32 of 1/2 degree from -8.83 down.
+
+    0.01 degrees are taken off, so that no beam meets the border of a row.
+    """
+    upper, lower = 2 - torch.arange(32) / 3, -8.83 - torch.arange(32) / 2
+    inclinations = torch.cat([upper, lower]).double() - 0.01
+    azimuth = (torch.arange(2083).double() + 0.5) * (2 * math.pi / 2083)
+    up = inclinations.deg2rad()[:, None]
+    xyz = up.cos() * azimuth.cos(), up.cos() * azimuth.sin(), up.sin().expand(64, 2083)
+    points = (20 * torch.stack(xyz, dim=-1)).reshape(-1, 3).float()  # ring after ring, as a file
+
+    sensor = LidarSensor()
+    hit = range_image(points, SphericalProjection(sensor))[0] > 0
+    pitch = 28 / 64
+    expected = {math.floor((3 - angle) / pitch) for angle in inclinations.tolist()}
+    assert set(hit.any(dim=1).nonzero().flatten().tolist()) == expected
+    assert len(expected) == 56
+    assert hit[hit.any(dim=1)].all()  # a row is either full or empty: nothing was dropped
+    by_ring = range_image(points, RingProjection(sensor, tuple(inclinations.tolist())))[0] > 0
+    assert by_ring.all()
+
+    assert hit.any(dim=1).sum() < len(inclinations)  # "each beam has its row"
+    survive = hit.sum() / len(points)
+    assert survive == pytest.approx(0.43, abs=0.005)
+
+
+@st.composite
+def sensors(draw):
+    low = draw(st.floats(-85, 60))
+    return LidarSensor(
+        beams=draw(st.integers(1, 40)),
+        columns=draw(st.integers(1, 200)),
+        inclination_max_deg=low + draw(st.floats(1, 25)),
+        inclination_min_deg=low,
+        range_max_m=draw(st.floats(2, 500)),
+    )
+
+
+@pytest.mark.numerics
+@exhaustive
+@given(sensor=sensors(), seed=st.integers(0, 2**32))
+def test_an_image_comes_back_from_its_points(sensor, seed):
+    """Centres of pixels lie in their pixels, whatever the sensor; ranges to float32 rounding."""
+    generator = torch.Generator().manual_seed(seed)
+    share = torch.rand(sensor.beams, sensor.columns, generator=generator)
+    width = sensor.range_max_m - sensor.range_min_m
+    range_m = sensor.range_min_m + width * (0.001 + 0.998 * share)
+    range_m[torch.rand(range_m.shape, generator=generator) < 0.3] = EMPTY_RANGE_M
+    projection = SphericalProjection(sensor)
+    again, _ = range_image(points_of(range_m, projection), projection)
+    torch.testing.assert_close(again, range_m, rtol=3e-7, atol=0)
+    whole = unproject(range_m.clamp(min=2), projection)
+    row, column = projection.pixel_of(whole)
+    assert torch.equal(row, torch.arange(sensor.beams)[:, None].expand_as(row))
+    assert torch.equal(column, torch.arange(sensor.columns).expand_as(column))

@@ -23,7 +23,12 @@ from r3dpa.metrics.feature_distances import (
     PolynomialMMD,
     PrecisionRecall,
 )
-from r3dpa.metrics.functional import fd_infinity, frechet_distance_of, polynomial_mmd, shared_balls
+from r3dpa.metrics.functional import (
+    fd_infinity,
+    frechet_distance_of,
+    polynomial_mmd,
+    shared_balls,
+)
 from r3dpa.metrics.functional_bev import (
     BEVGrid,
     chamfer_squared,

@@ -160,14 +160,26 @@ class TestWorkLeftOut:
         assert len(grads) == len(list(module.discriminator.parameters()))
         assert not any(g.count_nonzero() for g in grads)
 
+    @pytest.mark.numerics("loss of weight zero")
+    def test_a_discriminator_of_weight_0_is_not_called(self):
+        weights = LossWeights(adversarial=0.0, discriminator=0.0)
+        module = stage_module("joint", weights=weights)
+        calls = passes_through(module.discriminator)
+        train(module)
+        assert not calls
+
+    @pytest.mark.numerics("parameters a pass does not use")
     @pytest.mark.parametrize(
-        "names", [{"reconstruction"}, {"kl"}, {"adversarial", "vae_alignment", "sit_alignment"}]
+        "names",
+        [{"reconstruction"}, {"kl"}, {"adversarial", "vae_alignment", "sit_alignment"}],
     )
     def test_losses_of_weight_0_are_not_computed(self, names):
         weights = LossWeights(**dict.fromkeys(names, 0.0))
         module = train(stage_module("joint", weights=weights))
         assert module.parts[0].keys() == REACH["joint"].keys() - names
-        projector = any(name.startswith("sit.projector") for name in module.grads[0])
+        trained = {name for name, p in module.named_parameters() if p.requires_grad}
+        assert set(module.grads[0]) == trained  # DDP waits for the gradient of each
+        projector = any(name.startswith("sit.projector") for name in trained)
         assert projector == ("sit_alignment" not in names)
 
     def test_without_denoising_the_last_blocks_rest(self):
