@@ -370,3 +370,11 @@ def test_report_by_hand():
     assert idle.num_written == 0
     empty = drives.make_report([summaries[0] | {"points": 0}], 0)
     assert "1 of them hold no points" in str(empty)
+
+
+@pytest.mark.fuzz
+@pytest.mark.parametrize("drive", ["../../x", "/etc", "0003/../..", ""])
+def test_drives_of_a_manifest_that_leave_the_folder_are_refused(drive, tmp_path):
+    (tmp_path / "simulation.json").write_text(json.dumps({"scans": 3, "drives": [drive]}))
+    with pytest.raises(ValueError, match=r"simulation\.json does not say"):
+        expected_scans(tmp_path)

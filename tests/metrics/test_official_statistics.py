@@ -210,3 +210,24 @@ class TestCommand:
         assert "left_out" in printed
         assert (out / "table.tex").exists()
         assert not (out / "birds_eye.png").exists()
+
+
+@pytest.mark.fuzz
+@pytest.mark.parametrize(
+    ("pickled", "reason"),
+    [
+        (b"\x80\x04}r\xff\xff\xff\x7f.", "no attribute 'item'"),
+        (b"\x80\x05\x8e" + (2**40).to_bytes(8, "little") + b"abc.", "EOFError"),
+        (b"cnumpy\nndarray\n(I1099511627776\ntR.", "not callable"),
+        (
+            pickle.dumps(np.array([None] * 77), 3).replace(b"KM\x85", b"J\xff\xff\xff\x7f\x85"),
+            r"array of shape \(2147483647,\) is cut short",
+        ),
+    ],
+)
+def test_pickles_that_claim_much_memory_are_refused(pickled, reason, tmp_path):
+    path = tmp_path / "statistics.npy"
+    np.save(path, np.array(None), allow_pickle=True)
+    path.write_bytes(path.read_bytes()[:128] + pickled)
+    with pytest.raises(ValueError, match=rf"statistics\.npy: is no official .*{reason}"):
+        OfficialStatistics.load(path)

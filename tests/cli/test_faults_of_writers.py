@@ -15,6 +15,7 @@ from tiny_networks import tiny_checkpoint
 
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
 
+pytestmark = pytest.mark.faults
 # When and where something was made, and what fills the disk.
 _NOT_PROMISED = {"metadata.json", "filler"}
 GEOMETRY = ScanGeometry(SphericalProjection(LidarSensor(16, 64)), RangeCodec(), (2, 8))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import signal
 from functools import partial
@@ -21,6 +22,9 @@ from fault_commands import (
     pause,
 )
 
+from r3dpa.cli import main
+
+pytestmark = pytest.mark.faults
 STEP = "r3dpa.modules.VAEAlignment.training_step"
 TERMINATE, INTERRUPT = (
     partial(signal.raise_signal, number) for number in (signal.SIGTERM, signal.SIGINT)
@@ -190,3 +194,26 @@ def test_scans_lost_between_index_and_read(kept, says, own_scans, tmp_path, ende
     assert_whole(tmp_path / "run")
     shutil.copytree(saved, own_scans, dirs_exist_ok=True)
     goes_on(tmp_path / "run", scans=own_scans)
+
+
+READERS = {
+    **{
+        f"fit {key}": lambda ckpt, out, scans, key=key: fit_words(scans, out, key, ckpt)
+        for key in ("--ckpt_path", "--model.init_args.init_from")
+    },
+    "test": lambda ckpt, out, scans: ["test", *fit_words(scans, out, "--ckpt_path", ckpt)[1:]],
+    "sample": lambda ckpt, out, scans: ["sample", "--ckpt", ckpt, "--out", out],
+    "convert": lambda ckpt, out, scans: ["convert", ckpt, out.with_suffix(".safetensors")],
+}
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_a_checkpoint_cut_short(reader, scans_folder, tmp_path):
+    ckpt = tmp_path / "last.ckpt"
+    torch.save({"state_dict": {"weight": torch.zeros(1000)}}, ckpt)
+    words = READERS[reader](ckpt, tmp_path / "out", scans_folder)
+    for kept in (ckpt.stat().st_size - 1, 0):
+        os.truncate(ckpt, kept)
+        with pytest.raises(ValueError, match=f"cannot read {ckpt}: .*damaged"):
+            main([str(word) for word in words])
+    assert not [path for path in tmp_path.rglob("*") if path.is_file() and path != ckpt]

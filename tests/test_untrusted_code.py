@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-PACKAGE = Path(__file__).resolve().parents[2] / "src" / "r3dpa"
+pytestmark = pytest.mark.fuzz
+PACKAGE = Path(__file__).resolve().parents[1] / "src" / "r3dpa"
 #: Restricted unpicklers, each of which looks every class up in a table.
 UNPICKLERS = {"metrics/official_statistics.py"}
 _DANGER = re.compile(
