@@ -7,7 +7,7 @@ import torch
 from draws import drawn
 from lightning.pytorch.callbacks import StochasticWeightAveraging
 from lightning.pytorch.plugins import MixedPrecision
-from tiny_stages import QUIET, TinyData, group_of, stage_module, train
+from tiny_stages import QUIET, REACH, TinyData, group_of, stage_module, train
 from torch import nn
 
 from r3dpa.callbacks import StepGuard
@@ -16,23 +16,6 @@ from r3dpa.modules.stage import frozen
 
 pytestmark = QUIET
 CLIP_BY_VALUE = {"gradient_clip_val": 1.0, "gradient_clip_algorithm": "value"}
-ENCODER, DECODER = {"vae.encoder", "vae.quant_conv"}, {"vae.decoder", "vae.post_quant_conv"}
-DISCRIMINATOR = {"discriminator.main"}
-ALIGNED = {"sit.x_embedder", "sit.t_embedder", "sit.y_embedder", "sit.blocks.0"}
-REST = {"sit.blocks.1", "sit.final_layer"}
-PROJECTOR = {"sit.projector"}
-VAE_LOSSES = {"reconstruction": ENCODER | DECODER, "kl": ENCODER}
-VAE_LOSSES |= {"adversarial": ENCODER | DECODER, "discriminator": DISCRIMINATOR}
-SIT_LOSSES = {"denoising": ALIGNED | REST, "sit_alignment": ALIGNED | PROJECTOR}
-REACH = {
-    "vae_alignment": VAE_LOSSES | {"vae_alignment": ENCODER | PROJECTOR | {"sit.x_embedder"}},
-    "joint": VAE_LOSSES | SIT_LOSSES | {"vae_alignment": ENCODER},
-    "flow_matching": SIT_LOSSES,
-    "few_step": {
-        "denoising": {"sit.average"},
-        "reconstruction": {"thin_decoder.decoder", "thin_decoder.post_quant_conv"},
-    },
-}
 
 
 def separated(stage, **weights):

@@ -5,21 +5,14 @@ import numpy as np
 import pytest
 import torch
 from lightning import Trainer
+from point_clouds import GRID, cloud
 from tiny_stages import SILENT
 
 from r3dpa.data import LidarDataModule, write_bin
 from r3dpa.data.datamodules import PointDataModule
 from r3dpa.data.datasets import DrawnPoints
-from r3dpa.features import Masking, ScanGrid, WaffleIron, WaffleIronS, collate_scans
+from r3dpa.features import Masking, WaffleIron, WaffleIronS, collate_scans
 from r3dpa.modules import PointPretraining
-
-GRID = ScanGrid((-8.0, -8.0, -2.0), (8.0, 8.0, 4.0), cell_m=0.5, voxel_m=0.3, num_neighbors=4)
-
-
-def cloud(seed=0, num_points=800):
-    generator = torch.Generator().manual_seed(seed)
-    xyz = torch.randn(num_points, 3, generator=generator) * torch.tensor([4.0, 4.0, 1.0])
-    return torch.cat([xyz, torch.rand(num_points, 1, generator=generator)], dim=1)
 
 
 @pytest.fixture

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 import torch
 from resolved_fits import resolved
-from test_unet_stages import tiny_unet
 from tiny_stages import QUIET, group_of, stage_module, tiny_sit, train
+from tiny_unet import tiny_unet
 
 from r3dpa.ablation import make_plan
 from r3dpa.modules import LossWeights

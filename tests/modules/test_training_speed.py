@@ -7,9 +7,8 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from test_gradients import REACH
-from test_stages import QUICK, load
-from tiny_stages import QUIET, TinyData, stage_module, train
+from stage_runs import QUICK, load
+from tiny_stages import QUIET, REACH, TinyData, stage_module, train
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from r3dpa.checkpoints import read_checkpoint, save_checkpoint
