@@ -34,16 +34,12 @@ TINY = {
         "optimizer.warmup_steps": 0,
     },
 }
-
-
 AUTOENCODER = {
     "num_codes": 8,
     "channels": 32,
     "channel_multipliers": [1, 1, 1, 1],
     "num_res_blocks": 1,
 }
-
-
 TINY["lidm"] = {
     "network.init_args": {
         "input_size": [4, 8],
@@ -54,8 +50,6 @@ TINY["lidm"] = {
     },
     "first_stage.init_args": AUTOENCODER,
 }
-
-
 FIRST_STAGES = {  # of the baselines that have one
     "lidm": (
         "lidm_first_stage",
@@ -65,8 +59,6 @@ FIRST_STAGES = {  # of the baselines that have one
         },
     ),
 }
-
-
 SETTINGS = {
     "data.init_args.num_scans": 12,
     "data.init_args.sensor.beams": 16,

@@ -218,9 +218,14 @@ def test_grids_of_a_single_file_need_a_folder(tmp_path, data, sensor, scaled_poi
         ({"seed": -1}, "seed must be at least 0"),
     ],
 )
-def test_bad_arguments(data, options, message):
+def test_bad_arguments_are_refused(data, options, message):
     with pytest.raises(ValueError, match=message):
         data(**options)
+
+
+def test_a_sensor_by_its_name_is_refused():
+    with pytest.raises(ValueError, match=r"sensor must be a LidarSensor .* got 'hdl32e'"):
+        LidarDataModule(scans="scans", sensor="hdl32e")
 
 
 def test_simulated_data_are_made_once_and_feed_a_fit(tmp_path, scaled_points, fit):

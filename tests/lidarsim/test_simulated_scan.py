@@ -151,3 +151,8 @@ def test_a_simulator_gives_the_scans_of_its_drive():
     assert scan.scene == scene
     assert Simulator(sensor="vls128").sensor.num_beams == 128
     assert doctest.testmod(module).failed == 0
+
+
+def test_weather_of_another_kind_is_refused():
+    with pytest.raises(ValueError, match=r"an object such as Weather\(rain_mm_h=3\), got a dict"):
+        Simulator(weather={"rain_mm_h": 3})
