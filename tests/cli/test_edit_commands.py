@@ -247,11 +247,6 @@ REFUSED = [
     ("vary", "--scan tilted.bin", r"tilted.bin: .*outside the field"),
     ("vary", "--scan two.npz", r"holds 2 scans \(x, y\)"),
     ("vary", "--scan gone.bin", "gone.bin"),
-    (
-        "mix",
-        "--ckpt None.safetensors --left a.bin --right b.bin",
-        "None.safetensors was trained without 3D features",
-    ),
     ("interpolate", "--left a.bin --right b.bin --frames 1", "at least 2"),
 ]
 
