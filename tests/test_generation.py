@@ -99,7 +99,7 @@ def test_a_request_for_no_scene_is_refused(none):
 
 
 @pytest.mark.parametrize("wrong", [True, "3", 1.5])
-def test_what_is_no_number_of_scenes_is_refused(wrong):
+def test_numbers_of_scenes_that_are_none_are_refused(wrong):
     with pytest.raises(ValueError, match="give a number of scenes or their indices, got"):
         generator().generate(wrong)
 

@@ -37,7 +37,7 @@ from r3dpa.nn.perturbed_attention import velocity_and_perturbed
         *[("ab3", 5, 5), ("dpmpp_2m", 5, 5), ("unipc", 5, 5), ("euler_maruyama", 5, 5)],
     ],
 )
-def test_network_evaluations(solver, steps, evaluations):
+def test_evaluations_of_each_solver_are_counted(solver, steps, evaluations):
     """As counted by the network, of which the batch is one call."""
     scenes = generator(SamplerConfig(solver, steps))
     calls = []
@@ -86,7 +86,7 @@ def test_tables_of_modulations_give_the_scenes_of_the_plain_network(sampler, pat
     assert ((found.range_m > 0) == (half.range_m > 0)).float().mean() > 0.95
 
 
-def test_another_sampler_gets_another_table():
+def test_a_new_sampler_gets_a_new_table_of_modulations():
     scenes = generator(SamplerConfig("ab2", 4))
     before = scenes.generate([0])
     sampler = SamplerConfig("ab2", 6, shift=2.0)
@@ -290,7 +290,7 @@ class TestFewSteps:
         assert not torch.allclose(few.generate([0]).latents, first)
         assert few.generate([0]).nfe == 4
 
-    def test_what_makes_no_sense_is_refused_by_name(self, few_step):
+    def test_average_velocities_are_refused_where_they_make_no_sense(self, few_step):
         sampler = SamplerConfig("average_velocity", 2)
         with pytest.raises(ValueError, match="a checkpoint of stage few_step"):
             generator(sampler)
@@ -306,7 +306,7 @@ class TestFewSteps:
         with pytest.raises(ValueError, match=r"the ODE solvers are.*got 'average_velocity'"):
             ode_solver("average_velocity")  # of edits too
 
-    def test_the_official_layout_has_no_place_for_it(self, few_step, tmp_path):
+    def test_the_official_layout_has_no_place_for_average_velocities(self, few_step, tmp_path):
         with pytest.raises(ValueError, match=r"stage few_step.*no official counterpart"):
             convert(few_step.path, tmp_path / "few.pt", to="official")
         convert(few_step.path, tmp_path / "half.safetensors", half=True)

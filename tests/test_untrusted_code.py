@@ -55,6 +55,6 @@ def test_dangers_are_found(source):
     assert dangers(source)
 
 
-def test_what_is_safe_passes():
+def test_safe_calls_pass():
     calls = ["torch.load(f, weights_only=True)", "np.load(f, allow_pickle=False)"]
     assert not dangers("\n".join([*calls, "yaml.safe_load(t)", "network.eval()", "np.load(f)"]))

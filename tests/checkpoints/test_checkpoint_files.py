@@ -190,7 +190,7 @@ class TestLoadInto:
         assert "vae:" not in text
         torch.testing.assert_close(targets["vae"].state_dict(), before, **EXACT)
 
-    def test_long_lists_are_shortened(self, checkpoint):
+    def test_long_lists_of_differences_are_shortened(self, checkpoint):
         deeper = SiT(**{**SIT_ARGS, "depth": 5})
         with pytest.raises(ValueError, match=r"sit: \.\.\. and 10 more"):
             load_into({"sit": deeper}, checkpoint, stage="joint")  # 20 keys: 10 per block

@@ -33,7 +33,7 @@ class TestOfficial:
     @pytest.mark.parametrize(
         ("content", "message"), [({"weights": 1}, r"holds \['weights'\]; exp"), ([1], "holds list")]
     )
-    def test_something_else(self, tmp_path, content, message):
+    def test_files_of_another_layout_are_refused(self, tmp_path, content, message):
         torch.save(content, tmp_path / "a.pt")
         with pytest.raises(ValueError, match=message):
             read_checkpoint(tmp_path / "a.pt")
@@ -51,7 +51,7 @@ class TestOfficial:
         with pytest.raises(ValueError, match=r"no vae \(the file's VAE is not for range images"):
             read.network("vae")
 
-    def test_options_beside_the_file(self, official, tmp_path):
+    def test_options_beside_an_official_file_are_read(self, official, tmp_path):
         (tmp_path / "args.json").write_text(json.dumps(vars(official.pop("args"))))
         (tmp_path / "checkpoints").mkdir()
         torch.save(official, tmp_path / "checkpoints" / "a.pt")
@@ -136,7 +136,7 @@ class TestConvert:
         changed = from_official(content, Path("a.pt"), sit_args={"alignment_depth": 1})
         assert changed.network("ema").arguments["alignment_depth"] == 1
 
-    def test_report_and_refusals(self, official, tmp_path):
+    def test_a_conversion_reports_what_it_left_out_and_overwrites_nothing(self, official, tmp_path):
         official["opt"] = {"state": {}}
         torch.save(official, tmp_path / "a.pt")
         out = tmp_path / "a.safetensors"

@@ -30,7 +30,7 @@ class TestTransfer:
     def results(self, report):
         return {row.group: row.result for row in report}
 
-    def test_a_twin_keeps_everything(self):
+    def test_a_network_of_the_same_size_keeps_all_weights(self):
         source, sit, norm = self.source(), SiT(**SIT_ARGS), LatentNorm(4)
         report = transfer_rgb(source, sit, norm, keep_projector=True)
         assert set(self.results(report).values()) == {"kept"}
@@ -50,7 +50,7 @@ class TestTransfer:
             ),
         ],
     )
-    def test_what_does_not_fit_is_fresh(self, changes, expected):
+    def test_layers_that_do_not_fit_are_fresh(self, changes, expected):
         sit = randomised(SiT(**SIT_ARGS))
         before = {key: value.clone() for key, value in sit.state_dict().items()}
         rows = transfer_rgb(self.source(**changes), sit, LatentNorm(4), True)
@@ -84,7 +84,7 @@ class TestTransfer:
             ),
         ],
     )
-    def test_anything_else_is_an_error_before_any_change(self, changes, message):
+    def test_other_differences_are_an_error_before_any_change(self, changes, message):
         sit = SiT(**SIT_ARGS | ({"num_classes": 4} if "num_classes" in changes else {}))
         before = copy.deepcopy(sit.state_dict())
         with pytest.raises(ValueError, match=message):

@@ -41,14 +41,14 @@ class TestHelp:
         assert all(f"{name} [" in out for name in read)
 
     @pytest.mark.parametrize("command", ["fit", "data features"])
-    def test_of_stages_and_extraction(self, command, capsys):
+    def test_help_of_stages_and_extraction(self, command, capsys):
         with pytest.raises(SystemExit) as stop:
             main([*command.split(), "--help"])
         assert stop.value.code == 0
         assert f"{command} [" in capsys.readouterr().out
 
     @pytest.mark.parametrize("words", [[], ["-h"], ["edit"], ["edit", "--help"]])
-    def test_of_nothing_and_of_a_group(self, words, capsys):
+    def test_help_of_no_command_and_of_a_group(self, words, capsys):
         main(words)
         out = capsys.readouterr().out
         assert out.startswith(f"usage: r3dpa {'edit ' if 'edit' in words else ''}COMMAND [options]")

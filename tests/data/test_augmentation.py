@@ -137,7 +137,7 @@ def test_image_mask_and_grid_of_a_sample_get_the_view_that_was_drawn(augmented, 
     assert views == {View(k, mirrored, 4) for k in range(4) for mirrored in (False, True)}
 
 
-def test_off_by_default_and_then_nothing_changes(augmented, fit):
+def test_augmentation_is_off_by_default_and_then_changes_nothing(augmented, fit):
     assert Augmentation() == LidarDataModule("*.bin").augmentation
     module = augmented(Augmentation())
     batches = fit(module, 10).trained
@@ -161,13 +161,14 @@ def test_draws_depend_on_seed_epoch_and_scan():
 
 
 @pytest.mark.parametrize("augmentation", [Augmentation(rotate=True), Augmentation(flip=True)])
-def test_one_without_the_other_draws_the_same(augmentation):
+def test_rotation_and_mirroring_are_drawn_independently(augmentation):
     for index in range(20):
         both, one = BOTH.draw(0, 0, index, 64), augmentation.draw(0, 0, index, 64)
         assert one.columns == (both.columns if augmentation.rotate else 0)
         assert one.mirrored == (both.mirrored and augmentation.flip)
 
 
+@pytest.mark.numerics("seeds of loader processes")
 def test_resume_goes_on_with_the_same_draws(tmp_path, augmented, fit):
     """Within an epoch; loader processes draw what this process would."""
     whole = fit(augmented(), 9).trained

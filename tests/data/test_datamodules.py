@@ -128,7 +128,7 @@ def test_held_out_folders_and_limit(tmp_path, make_scans, sensor):
         LidarDataModule(str(tmp_path / "scans"), val_drives=["city/c"]).split()
 
 
-def test_official_split(tmp_path, make_scans, sensor):
+def test_the_official_split_names_its_drives(tmp_path, make_scans, sensor):
     extra = "2013_05_28_drive_0008_sync"  # recorded for a benchmark, part of no split
     for seed, drive in enumerate([*KITTI360_DRIVES["train"], *KITTI360_DRIVES["val"], extra]):
         make_scans(tmp_path / "data_3d_raw" / drive / "velodyne_points/data", 2, seed)
@@ -176,7 +176,7 @@ def test_rings_do_not_depend_on_the_limit(tmp_path):
 
 
 @pytest.mark.parametrize("part", ["train", "val"])
-def test_one_split_alone(tmp_path, make_scans, sensor, part, fit, trainer, recorder):
+def test_a_split_can_be_loaded_alone(tmp_path, make_scans, sensor, part, fit, trainer, recorder):
     """KITTI-360 with drives of one split: usable but for the stage that needs the other one."""
     drive = KITTI360_DRIVES[part][0]
     make_scans(tmp_path / "data_3d_raw" / drive / "velodyne_points/data", 4)

@@ -178,7 +178,7 @@ def test_pipes_and_devices_are_not_read(tmp_path):
 
 
 @pytest.mark.parametrize("width", [3, 4])
-def test_round_trips(tmp_path, width):
+def test_written_scans_come_back(tmp_path, width):
     points = POINTS[:, :width]
     write_bin(tmp_path / "new/a.bin", points)
     expected = np.concatenate([POINTS[:, :3], POINTS[:, 3:] * (width == 4)], 1)
@@ -306,7 +306,7 @@ def make_kitti360(root, make_scans, drives):
         make_scans(root / "data_3d_raw" / drive / "velodyne_points/data", 2, seed)
 
 
-def test_official_layout(tmp_path, make_scans):
+def test_scans_in_the_official_layout_are_found(tmp_path, make_scans):
     drives = KITTI360_DRIVES["train"] + KITTI360_DRIVES["val"]
     make_kitti360(tmp_path, make_scans, drives)
     make_scans(tmp_path / "data_3d_raw" / drives[0] / "sick_points/data", 1)  # another sensor

@@ -101,7 +101,7 @@ def test_wrong_shapes_and_unwritable_folders_are_named(halves, tmp_path):
 
 
 @pytest.mark.parametrize("value", [torch.inf, torch.nan])
-def test_what_is_not_finite_is_not_kept(halves, value):
+def test_rows_that_are_not_finite_are_not_stored(halves, value):
     """It would cost a step in every epoch; the rows before it stay."""
     tensors = torch.zeros(5, *SHAPE)
     tensors[3, 1, 2] = value

@@ -106,6 +106,7 @@ def test_order_from_end_to_end(solver, order, ends, path):
 
 @pytest.mark.parametrize(("solver", "degree"), [(ab2, 1), (ab3, 2)])
 @pytest.mark.parametrize("flip", [False, True])
+@pytest.mark.numerics("multistep solver on unequal steps")
 def test_adams_bashforth_integrates_polynomials_on_uneven_grids(solver, degree, flip):
     """Once its history is full; what the first steps, of lower order, add is subtracted."""
     times = UNEVEN.flip(0) if flip else UNEVEN
@@ -252,6 +253,7 @@ def test_unknown_solvers_and_counts_are_refused(call, message):
 
 @pytest.mark.parametrize("solver", ODE_SOLVERS)
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.bfloat16])
+@pytest.mark.numerics("state in half precision")
 def test_state_keeps_its_dtype_and_times_are_at_least_float32(solver, dtype):
     seen = []
 

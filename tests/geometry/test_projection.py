@@ -29,7 +29,7 @@ def random_points(count, seed=0, farthest=70.0):
     return torch.nn.functional.normalize(direction, dim=-1) * distance
 
 
-def test_axes():
+def test_rows_run_down_and_columns_clockwise():
     """Up is row 0; left of the sensor (+y) is a quarter of the way, right three quarters."""
     points = torch.tensor([[10.0, 0, 9], [10, 0, -9], [-10, 0, 0], [0, 10, 0], [0, -10, 0]])
     row, column = SphericalProjection(SMALL).pixel_of(points)
@@ -67,7 +67,7 @@ def test_range_limits_are_exclusive_and_fov_is_not():
     assert (range_m[0] > 0).sum() == (range_m[-1] > 0).sum() == 1
 
 
-def test_padding_and_batches():
+def test_padded_batches_give_the_images_of_single_scans():
     points, projection = random_points(500), SphericalProjection(SMALL)
     values = torch.rand(500, 2, generator=torch.Generator().manual_seed(2))
     padded_points = torch.full((2, 600, 3), math.nan)
@@ -84,6 +84,7 @@ def test_padding_and_batches():
 
 
 @pytest.mark.parametrize("shape", [(0, 3), (2, 0, 3), (0, 5, 3), (1, 3)], ids=str)
+@pytest.mark.numerics("scans of 0, 1 and 2 points")
 def test_scans_of_no_or_one_point(shape):
     points, projection = torch.full(shape, 5.0), SphericalProjection(SMALL)
     count = points.numel() // 3
@@ -136,7 +137,7 @@ def test_pooling_equals_a_loop():
     assert unfiltered.sum() == len(points) > counts.sum()
 
 
-def test_wrong_shapes_are_refused():
+def test_points_and_images_of_wrong_shapes_are_refused():
     projection, points = SphericalProjection(SMALL), torch.zeros(5, 3)
     for function, arguments, message in (
         (projection.pixel_of, (torch.zeros(7, 4),), r"\(7, 4\)"),

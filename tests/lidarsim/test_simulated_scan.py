@@ -38,7 +38,7 @@ def rings_of(points):
     return np.append(0, np.cumsum(np.diff(azimuth) < 0))
 
 
-def test_types_and_ranges(street_scan):
+def test_points_labels_and_origins_have_their_types_and_ranges(street_scan):
     points, labels, origins = street_scan.points, street_scan.labels, street_scan.origins
     assert rings_of(points).max() == 63
     assert (points.dtype, labels.dtype, origins.dtype) == (np.float32, np.uint32, np.uint8)
@@ -85,7 +85,7 @@ def test_moving_sensor_stores_points_as_if_it_stood():
     assert len(points) != len(still) or np.abs(points - still[:, :3]).max() > 0.1
 
 
-def test_switches():
+def test_an_effect_can_be_switched_off_and_on():
     scene = Scene((WALL,), weather=Conditions(visibility_m=40))
     clear = simulate_scan(replace(scene, weather=DRY), hdl64e(90), (0,))
     off = simulate_scan(scene, hdl64e(90), (0,), {"fog": "off"})

@@ -162,7 +162,7 @@ def test_one_effect_leaves_the_draws_of_another_alone(scan):
     assert (np.intersect1d(dry.index, upright) == np.intersect1d(wet.index, upright)).all()
 
 
-def test_seeds(scan):
+def test_a_seed_gives_the_same_weather(scan):
     one, again, other = (Weather(snow_mm_h=2).apply(scan, seed) for seed in (1, 1, (1, "other")))
     assert same(one, again)
     assert one.index.tobytes() != other.index.tobytes()

@@ -149,7 +149,7 @@ class TestLoad:
             OfficialStatistics.load(write(tmp_path / "new.npy")).cells,
         )
 
-    def test_runs_no_code(self, tmp_path):
+    def test_a_pickle_runs_no_code(self, tmp_path):
         class Harm:
             def __reduce__(self):
                 return os.mkdir, (str(tmp_path / "harm"),)
@@ -180,12 +180,12 @@ class TestLoad:
             ),
         ],
     )
-    def test_errors_name_the_file(self, tmp_path, value, message):
+    def test_damaged_statistics_are_named_with_their_file(self, tmp_path, value, message):
         with pytest.raises(ValueError, match=message) as caught:
             OfficialStatistics.load(write(tmp_path / "named.npy", value))
         assert "named.npy" in str(caught.value)
 
-    def test_other_files(self, tmp_path, file):
+    def test_files_that_are_no_official_statistics_are_refused(self, tmp_path, file):
         np.save(tmp_path / "plain.npy", np.zeros(3))
         for name in ("plain.npy", "missing.npy"):
             with pytest.raises(ValueError, match=f"{name}: is no official statistics file"):

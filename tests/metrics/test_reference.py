@@ -189,7 +189,7 @@ def test_scans_must_come_as_announced():
         ReferenceStatistics(PROTOCOL, {}, ["a/0"], {})
 
 
-def test_other_features_are_refused():
+def test_features_unlike_those_of_the_reference_are_refused():
     with pytest.raises(ValueError, match="holds 0 of 11 scans"):
         empty().check([TOY])
     stored = filled()

@@ -30,6 +30,7 @@ def observed(request):
 
 
 class TestReach:
+    @pytest.mark.numerics("three networks in one graph")
     def test_every_loss_reaches_exactly_its_networks(self, observed):
         stage, module = observed
         found = {
@@ -47,6 +48,7 @@ class TestReach:
             torch.testing.assert_close(total, expected, atol=1e-6, rtol=1e-4)
 
     @pytest.mark.parametrize("part", ["vae_alignment", "discriminator"])
+    @pytest.mark.numerics("discriminator loss that is scaled down")
     def test_a_weight_scales_its_loss_and_its_gradient_alone(self, part):
         once, twice = (separated("joint", **{part: weight}) for weight in (1.5, 3.0))
         for name, value in once.parts[0].items():

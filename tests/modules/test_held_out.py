@@ -121,6 +121,7 @@ def evaluate(rank, num_processes, port, counts, folder):
     ],
 )
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded, use of fork")
+@pytest.mark.numerics("uneven last batch")
 def test_losses_do_not_depend_on_the_number_of_processes(
     num_processes, counts, tmp_path, one_thread
 ):

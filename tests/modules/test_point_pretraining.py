@@ -53,7 +53,7 @@ def test_nothing_is_learnt_from_hidden_points(module, masked):
     assert (changed - tokens)[hidden].abs().max() > 1e-4  # hidden points do read from the others
 
 
-def test_without_hidden_points_it_is_the_network(module, masked):
+def test_tokens_without_hidden_points_are_those_of_the_network(module, masked):
     module.eval()
     batch = collate_scans([each.scan for each in masked])
     nothing = torch.zeros(len(batch.features), dtype=torch.bool)
@@ -133,7 +133,7 @@ def test_draws_are_a_function_of_seed_epoch_and_scan(data):
     assert len(data.val_set) == 1
 
 
-def test_what_does_not_fit_is_refused(tmp_path, module, data):
+def test_points_and_networks_that_do_not_fit_are_refused(tmp_path, module, data):
     trainer = SimpleNamespace(datamodule=data)
     other = PointPretraining(WaffleIron(16, 3, (4, 4, 4)))
     other._trainer = trainer

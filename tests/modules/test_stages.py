@@ -11,7 +11,7 @@ import pytest
 import torch
 import wandb
 import yaml
-from stage_runs import QUICK, STAGES, assert_equal_runs, load
+from stage_runs import QUICK, STAGES, load
 
 from r3dpa.cli import main
 from r3dpa.data import read_scan
@@ -77,18 +77,6 @@ def test_joint_starts_from_the_stage_before(smoke_args, vae_checkpoint, from_pre
         for key in keys:
             torch.testing.assert_close(after[key], before[key])
     torch.testing.assert_close(after["ema.sit.pos_embed"], before["sit.pos_embed"])
-
-
-@pytest.mark.slow
-def test_resume_at_the_end_of_an_epoch_is_exact(smoke_args, from_previous, tmp_path):
-    """An epoch has five batches. Other stops: callbacks/test_resume.py."""
-    more = [*QUICK, *from_previous("joint")]
-    main(smoke_args("joint", tmp_path / "whole", *more, "--trainer.max_steps", "8"))
-    main(smoke_args("joint", tmp_path / "parts", *more, "--trainer.max_steps", "5"))
-    last = str(tmp_path / "parts" / "checkpoints" / "last.ckpt")
-    resume = ["--trainer.max_steps", "8", "--ckpt_path", last]
-    main(smoke_args("joint", tmp_path / "parts", *more, *resume))
-    assert_equal_runs(tmp_path / "whole", tmp_path / "parts", 8)
 
 
 @pytest.mark.ddp

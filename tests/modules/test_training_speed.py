@@ -30,7 +30,7 @@ def passes_through(network):
 
 class TestCachedLatents:
     @pytest.mark.parametrize("rotate", [pytest.param(False, marks=pytest.mark.slow), True])
-    def test_steps_are_those_with_the_encoder(
+    def test_steps_with_cached_latents_are_those_with_the_encoder(
         self, rotate, smoke_args, vae_checkpoint, tmp_path, monkeypatch
     ):
         """Three steps with the same draws, without rotation to the last bit but for batching.
@@ -61,14 +61,16 @@ class TestCachedLatents:
         blocks = [key for key in plain if key.startswith("sit.blocks")]
         assert max((before[key] - plain[key]).abs().max() for key in blocks) > 1e-3
 
-    def test_a_fast_dev_run_does_without(self, smoke_args, vae_checkpoint, tmp_path):
+    def test_a_fast_dev_run_writes_no_cache(self, smoke_args, vae_checkpoint, tmp_path):
         more = [*QUICK, "--trainer.fast_dev_run=1"]
         more += ["--model.init_args.init_from", str(vae_checkpoint)]
         main(smoke_args("flow_matching", tmp_path, *more, "--model.init_args.cache_latents=true"))
         assert not (tmp_path / "latents").exists()
 
     @pytest.mark.slow
-    def test_they_are_not_rounded_in_mixed_precision(self, smoke_args, vae_checkpoint, tmp_path):
+    def test_cached_latents_are_not_rounded_in_mixed_precision(
+        self, smoke_args, vae_checkpoint, tmp_path
+    ):
         """Bit for bit those of float32, in a folder of the same name."""
         more = ["--trainer.max_steps=1", "--model.init_args.init_from", str(vae_checkpoint)]
         more += ["--model.init_args.cache_latents=true", "--trainer.precision"]
@@ -103,7 +105,7 @@ class TestLayout:
         assert all(value.is_contiguous() for value in saved.values())
 
     @pytest.mark.parametrize("fused", [False, True])
-    def test_moments_follow_their_weights(self, fused):
+    def test_optimizer_moments_have_the_layout_of_their_weights(self, fused):
         weight = torch.nn.Parameter(torch.randn(4, 3, 2, 2).to(**CHANNELS_LAST))
         optimizer = torch.optim.AdamW([weight])
         weight.grad = torch.randn(4, 3, 2, 2)

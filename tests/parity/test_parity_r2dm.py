@@ -376,7 +376,7 @@ def test_r2dm_diffusion_every_array_is_compared(diffusion, unet_case):
     assert case["out/state_dict_key_count"] > count  # its constants are no weights here
 
 
-def test_ema(baseline_case):
+def test_ema_outputs(baseline_case):
     case = baseline_case("ema")
     config = case.config
     network = torch.nn.Linear(*case["in/initial_weight"].shape[::-1], bias=False)

@@ -82,7 +82,7 @@ def gradients_of(network, loss, **options):
     return found
 
 
-def test_hdit(hdit, compare):
+def test_hdit_outputs(hdit, compare):
     case, network = hdit
     results, image, velocity = outputs_of(case, network)
     loss = (velocity - case["in/target"]).square().mean()
@@ -200,7 +200,7 @@ def test_released_layouts_are_read_strictly(name, baseline_listing, tmp_path):
         from_r2flow(content, tmp_path / "broken.pth")
 
 
-def test_flow(hdit, baseline_case, close):
+def test_flow_outputs(hdit, baseline_case, close):
     case, network = baseline_case("r2flow_flow"), hdit[1]
     geometry = ScanGeometry.from_dict(image_geometry(network.coords, "log_depth"))
     results = training_of(case, network)
