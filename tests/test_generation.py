@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from tiny_labelled import labelled_checkpoint
 from tiny_networks import SIT_ARGS, VAE_ARGS, tiny_networks
 from tiny_scenes import GEOMETRY, LATENT_SHAPE, ODE, SDE, SENSOR, generator
 
@@ -21,6 +22,7 @@ from r3dpa.checkpoints import (
 )
 from r3dpa.generation import SamplerConfig, SceneGenerator
 from r3dpa.geometry import (
+    SEMANTIC_CLASSES,
     RangeCodec,
     ScanGeometry,
     SphericalProjection,
@@ -276,3 +278,33 @@ def test_progress_is_shown_on_request(capsys):
 def test_a_sampler_by_its_name_is_refused():
     with pytest.raises(ValueError, match="sampler must be a SamplerConfig, got 'euler'"):
         generator().with_sampler("euler")
+
+
+def test_scenes_have_intensity_and_labels_at_their_returns(tmp_path):
+    path = labelled_checkpoint(tmp_path)
+    scenes = SceneGenerator.from_checkpoint(path, ODE, device="cpu").generate(2)
+    returns = scenes.range_m > 0
+    assert 0 < returns.sum() < returns.numel()
+    assert scenes.labels.shape == scenes.intensity.shape == scenes.range_m.shape
+    assert torch.equal(scenes.labels > 0, returns)
+    assert set(scenes.labels.unique().tolist()) <= {
+        0,
+        *(semantic.label for semantic in SEMANTIC_CLASSES),
+    }
+    assert len(scenes.labels[returns].unique()) > 2
+    assert scenes.intensity.min() == 0
+    assert scenes.intensity.max() <= 1
+    assert len(scenes.intensity[returns].unique()) > 100
+    for index in range(2):
+        kept = returns[index]
+        assert torch.equal(scenes.point_labels(index), scenes.labels[index][kept])
+        assert torch.equal(scenes.point_intensity(index), scenes.intensity[index][kept])
+        assert len(scenes.points(index)) == kept.sum()
+
+
+def test_scenes_without_intensity_and_labels_say_so():
+    scenes = generator(ODE).generate(1)
+    assert scenes.labels is None
+    assert scenes.intensity is None
+    with pytest.raises(ValueError, match="these scenes have no labels"):
+        scenes.point_labels(0)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from tiny_labelled import labelled_checkpoint
 from tiny_networks import tiny_checkpoint
 
 from r3dpa import SceneVAE
@@ -67,3 +68,19 @@ def test_a_vae_says_what_it_is_and_moves(vae, tmp_path):
     assert repr(vae) == "SceneVAE(16 x 64 pixels, latents 4 x 4 x 16, cpu)"
     path = tiny_checkpoint(tmp_path / "tiny.safetensors", GEOMETRY)
     assert SceneVAE.from_checkpoint(path, "cpu").to("meta").device.type == "meta"
+
+
+def test_a_scan_and_its_labels_become_latents_and_a_labelled_scene(tmp_path):
+    vae = SceneVAE.from_checkpoint(labelled_checkpoint(tmp_path), device="cpu")
+    torch.nn.init.normal_(vae.vae.encoder.further_in.weight)  # as a training makes it
+    generator = torch.Generator().manual_seed(0)
+    points = torch.cat([torch.randn(500, 3) * 10, torch.rand(500, 1, generator=generator)], dim=1)
+    labels = torch.full((500,), 26)
+    latents = vae.encode(points, labels)
+    assert not torch.equal(latents, vae.encode(points, labels + 1))  # trucks, not cars
+    assert torch.equal(latents, vae.encode(points.numpy(), (labels | 5 << 16).numpy()))
+    scenes = vae.decode(latents)
+    assert torch.equal(scenes.labels > 0, scenes.range_m > 0)
+    assert scenes.intensity.shape == (1, 16, 64)
+    with pytest.raises(ValueError, match="needs scans with an intensity"):
+        vae.encode(points[:, :3], labels)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from tiny_labelled import labelled_checkpoint
 from tiny_networks import tiny_checkpoint
 
 from lidarsim.scan_files import read_npz, read_points, read_scan
@@ -16,7 +17,7 @@ from r3dpa.cli import main
 from r3dpa.cli.parser import parse
 from r3dpa.cli.sample import sample as sample_command
 from r3dpa.flow.solvers import ODE_SOLVERS
-from r3dpa.generation import SamplerConfig
+from r3dpa.generation import SamplerConfig, SceneGenerator
 from r3dpa.geometry import (
     LidarSensor,
     RangeCodec,
@@ -100,6 +101,20 @@ class TestSample:
         assert (tmp_path / "range_m.npy").read_bytes() == before
         assert sample(tiny_file, tmp_path, "--seed", 1, "--overwrite")["seed"] == 1
         assert (tmp_path / "range_m.npy").read_bytes() != before
+
+    def test_labels_and_intensity_are_written(self, tmp_path):
+        ckpt = labelled_checkpoint(tmp_path)
+        sample(
+            ckpt, tmp_path / "out", "--solver", "euler", "--shift", 1, "--device", "cpu", pictures=1
+        )
+        sampler = SamplerConfig("euler", steps=3)
+        scenes = SceneGenerator.from_checkpoint(ckpt, sampler, device="cpu").generate(3)
+        for index in range(3):
+            points = read_scan(tmp_path / "out" / "bin" / f"{index:06d}.bin")
+            labels = np.fromfile(tmp_path / "out" / "labels" / f"{index:06d}.label", "<u4")
+            assert np.array_equal(labels, scenes.point_labels(index).numpy())
+            np.testing.assert_allclose(points[:, 3], scenes.point_intensity(index), atol=1e-5)
+        assert (tmp_path / "out" / "scenes.html").exists()
 
     def test_metadata_is_enough_to_repeat_the_run(self, scenes, tiny_file):
         metadata = json.loads((scenes / "metadata.json").read_text())
