@@ -4,23 +4,17 @@ import numpy as np
 import pytest
 import torch
 from tiny_labelled import labelled_checkpoint
-from tiny_networks import tiny_checkpoint
+from tiny_networks import GEOMETRY, tiny_checkpoint
 
 from r3dpa import SceneVAE
 from r3dpa.geometry import (
-    LidarSensor,
-    RangeCodec,
-    ScanGeometry,
-    SphericalProjection,
     range_image,
 )
-
-GEOMETRY = ScanGeometry(SphericalProjection(LidarSensor(16, 64)), RangeCodec(), (2, 8))
 
 
 @pytest.fixture(scope="module")
 def vae(tmp_path_factory):
-    path = tiny_checkpoint(tmp_path_factory.mktemp("vae") / "tiny.safetensors", GEOMETRY)
+    path = tiny_checkpoint(tmp_path_factory.mktemp("vae") / "tiny.safetensors")
     return SceneVAE.from_checkpoint(path, "cpu")
 
 
@@ -66,7 +60,7 @@ def test_a_scan_becomes_the_posterior_mean_and_points_on_the_rays(vae):
 
 def test_a_vae_says_what_it_is_and_moves(vae, tmp_path):
     assert repr(vae) == "SceneVAE(16 x 64 pixels, latents 4 x 4 x 16, cpu)"
-    path = tiny_checkpoint(tmp_path / "tiny.safetensors", GEOMETRY)
+    path = tiny_checkpoint(tmp_path / "tiny.safetensors")
     assert SceneVAE.from_checkpoint(path, "cpu").to("meta").device.type == "meta"
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from tiny_networks import SIT_ARGS, VAE_ARGS
+from tiny_networks import GEOMETRY, SIT_ARGS, VAE_ARGS
 
 from r3dpa.callbacks import EMASnapshots
 from r3dpa.checkpoints import (
@@ -20,13 +20,9 @@ from r3dpa.checkpoints import (
 )
 from r3dpa.cli import main
 from r3dpa.flow.autoguidance import renormalised
-from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
+from r3dpa.geometry import ScanGeometry
 from r3dpa.modules import FlowMatching, VAEAlignment
 from r3dpa.nn import VAE, LatentNorm, PatchDiscriminator, SiT
-
-GEOMETRY = ScanGeometry(
-    SphericalProjection(LidarSensor(beams=16, columns=64)), RangeCodec(), (2, 8)
-)
 
 
 def module(kind=FlowMatching, **more):

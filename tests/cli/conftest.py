@@ -10,7 +10,6 @@ from tiny_networks import tiny_checkpoint
 
 from r3dpa.callbacks import scene_scoring
 from r3dpa.cli import main
-from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
 from r3dpa.metrics import scene
 
 CSV_LOGGER = {
@@ -38,10 +37,8 @@ def joint_checkpoint(joint_run):
 @pytest.fixture(scope="session")
 def tiny_file(tmp_path_factory):
     """Checkpoint of random weights for images of 16 x 64, without a training."""
-    projection = SphericalProjection(LidarSensor(beams=16, columns=64))
-    geometry = ScanGeometry(projection, RangeCodec(), (2, 8))
     path = tmp_path_factory.mktemp("tiny") / "tiny.safetensors"
-    return tiny_checkpoint(path, geometry, step=3, feature_source="geometric")
+    return tiny_checkpoint(path, step=3, feature_source="geometric")
 
 
 @pytest.fixture(scope="module")

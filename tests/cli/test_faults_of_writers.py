@@ -13,12 +13,9 @@ import pytest
 from fault_commands import At, Command, assert_whole, fill, kill_worker, limit_files, pause, rows_of
 from tiny_networks import tiny_checkpoint
 
-from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
-
 pytestmark = pytest.mark.faults
 # When and where something was made, and what fills the disk.
 _NOT_PROMISED = {"metadata.json", "filler"}
-GEOMETRY = ScanGeometry(SphericalProjection(LidarSensor(16, 64)), RangeCodec(), (2, 8))
 SENSOR = {"class_path": "r3dpa.geometry.LidarSensor", "init_args": {"beams": 16, "columns": 64}}
 
 
@@ -45,7 +42,7 @@ def jobs(scans_folder, tmp_path_factory):
     (folder / "data.yaml").write_text(json.dumps({"data": data}))
     extractor = ["--extractor", "geometric", "--trainer.accelerator", "cpu"]
     sampler = ["--steps", 2, "--pictures", 0, "--device", "cpu", "--formats", "bin,ply,npz"]
-    ckpt = tiny_checkpoint(folder / "tiny.safetensors", GEOMETRY)
+    ckpt = tiny_checkpoint(folder / "tiny.safetensors")
     return {
         "simulate": Job(
             ["simulate", "--scans", 6, "--sensor", lasers],

@@ -20,8 +20,6 @@ from r3dpa.flow.solvers import ODE_SOLVERS
 from r3dpa.generation import SamplerConfig, SceneGenerator
 from r3dpa.geometry import (
     LidarSensor,
-    RangeCodec,
-    ScanGeometry,
     SphericalProjection,
     in_range,
     points_of,
@@ -151,8 +149,7 @@ class TestSample:
             parse(sample_command, ["--ckpt", "a", "--out", "b", "--solver", solver], "sample")
 
     def test_instant_takes_few_steps_and_the_thin_decoder(self, tiny_file, tmp_path, capsys):
-        geometry = ScanGeometry(SphericalProjection(SENSOR), RangeCodec(), (2, 8))
-        few = tiny_checkpoint(tmp_path / "few.safetensors", geometry, stage="few_step")
+        few = tiny_checkpoint(tmp_path / "few.safetensors", stage="few_step")
         words = ["--num", 1, "--quality", "instant"]
         found = sample(few, tmp_path / "thin", *words, steps=())
         assert found["sampler"]["solver"] == "average_velocity"
@@ -212,9 +209,8 @@ class TestSample:
             assert str(folder) not in (tmp_path / "metadata.json").read_text()
 
     def test_the_guidance_of_the_weights_is_recorded_and_can_be_turned_off(self, tmp_path):
-        geometry = ScanGeometry(SphericalProjection(SENSOR), RangeCodec(), (2, 8))
         recorded = {"perturbed_attention": {"block": 1, "scale": 1.5}}
-        path = tiny_checkpoint(tmp_path / "guided.safetensors", geometry, sampling=recorded)
+        path = tiny_checkpoint(tmp_path / "guided.safetensors", sampling=recorded)
         guided = sample(path, tmp_path / "guided")
         assert (guided["guidance_scale"], guided["nfe"]) == (1.5, 6)
         plain = sample(path, tmp_path / "plain", "--guidance_scale", 1)
