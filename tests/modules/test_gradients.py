@@ -141,13 +141,6 @@ class TestClipping:
 
 @pytest.mark.numerics
 class TestNonFiniteGradients:
-    def test_a_clipped_non_finite_gradient_would_break_the_weights(self):
-        """The naive way: inf / inf is NaN in one element, and 0 in all others."""
-        weight = nn.Parameter(torch.ones(3))
-        weight.grad = torch.tensor([1.0, torch.inf, 2.0])
-        nn.utils.clip_grad_norm_([weight], 1.0)
-        assert weight.grad.isnan().tolist() == [False, True, False]
-
     def test_a_bad_first_step_leaves_no_moments(self):
         module = train(stage_module("joint"), TinyData([True, False]))
         (_, first_moments), (weights, second_moments) = module.states
