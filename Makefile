@@ -90,13 +90,13 @@ test-numerics: $(READY) ## hard numerical cases
 	$(BIN)/pytest -m numerics
 
 test-faults: $(READY) ## kill, fill, cut: what is lost, and what the user sees
-	$(BIN)/pytest tests/faults
+	$(BIN)/pytest -m faults
 
 test-nodes: $(READY) ## two nodes on one machine, in network namespaces
-	OMP_NUM_THREADS=1 $(BIN)/pytest tests/scale_out
+	OMP_NUM_THREADS=1 $(BIN)/pytest -m nodes
 
 fuzz: $(READY) ## 100000 damaged files for all readers: about 6 minutes
-	nice -n 15 env OMP_NUM_THREADS=1 FUZZ_INPUTS=5000 $(BIN)/pytest -q tests/fuzz/test_fuzz_readers.py
+	nice -n 15 env OMP_NUM_THREADS=1 FUZZ_INPUTS=5000 $(BIN)/pytest -q tests/test_fuzz_readers.py
 
 notebooks: $(READY) ## run the notebooks, keeping their outputs
 	$(BIN)/pytest --nbmake --nbmake-timeout=300 --overwrite notebooks

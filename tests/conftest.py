@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import json
 import os
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -161,3 +162,31 @@ class ScaledPoints(nn.Module):
 def scaled_points():
     """The extractor class."""
     return ScaledPoints
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """``small_disk(num_bytes)``: folder of a disk of its own, in memory, of that size."""
+    folder = tmp_path / "disk"
+
+    def make(num_bytes: int) -> Path:
+        folder.mkdir()
+        _mount("-t", "tmpfs", "-o", f"size={num_bytes}", "tmpfs", folder)
+        return folder
+
+    yield make
+    if folder.is_mount():
+        subprocess.run(["umount", "--lazy", folder], check=True)
+
+
+@pytest.fixture
+def make_read_only():
+    """``make_read_only(disk)``: nothing can be written to a disk of ``small_disk`` any more."""
+    return lambda disk: _mount("-o", "remount,ro", disk)
+
+
+def _mount(*words):
+    try:
+        subprocess.run(["mount", *map(str, words)], check=True, capture_output=True, text=True)
+    except (OSError, subprocess.CalledProcessError) as error:
+        pytest.skip(f"this user may not mount a disk in memory: {getattr(error, 'stderr', error)}")

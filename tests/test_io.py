@@ -1,13 +1,33 @@
-"""Atomic writes, journals and locks."""
+"""Atomic writes, journals, locks and names in files."""
 
+import errno
 import multiprocessing
 import os
 import signal
 from pathlib import Path
 
 import pytest
+import torch
+from safetensors.torch import save_file
 
-from r3dpa.io import Journal, atomic_path, differences, only_writer
+from r3dpa.io import Journal, atomic_path, differences, only_writer, refuse_name
+
+BAD_NAMES = [
+    "../../x",
+    "/etc/x",
+    "a/../../x",
+    "a/./x",
+    "a//x",
+    "..",
+    ".",
+    "",
+    "C:x",
+    "c:\\x",
+    "a\\..\\x",
+]
+
+
+BAD_NAMES += ["a\0b", "a\nb", "x" * 2000]
 
 
 def test_the_file_is_on_the_disk_before_its_name_and_the_folder_after(tmp_path, monkeypatch):
@@ -116,3 +136,41 @@ def test_differences_of_requests_name_both_values():
         "columns 10 values there, [] now",
         "new None there, 'x' now",
     ]
+
+
+@pytest.mark.faults
+@pytest.mark.parametrize("writer", ["bytes", "torch", "safetensors"])
+def test_an_error_of_a_full_disk_names_the_file(writer, small_disk):
+    path = small_disk(1_000_000) / "file"
+
+    def write():
+        tensors = {"a": torch.zeros(1_000_000)}
+        with atomic_path(path) as temporary, temporary.open("wb") as file:
+            if writer == "bytes":
+                file.write(bytes(2_000_000))
+            elif writer == "torch":
+                torch.save(tensors, file)
+            else:
+                save_file(tensors, temporary)
+
+    with pytest.raises(OSError, match=rf"No space left on device: '{path}'"):
+        write()
+    assert not list(path.parent.iterdir())
+
+
+@pytest.mark.faults
+def test_a_disk_without_locks_is_used_with_a_warning(tmp_path, monkeypatch, caplog):
+    def no_locks(*_):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr("fcntl.flock", no_locks)
+    with only_writer(tmp_path / ".lock", "writes here"):
+        assert "has no locks: make sure that no other process writes here" in caplog.text
+
+
+@pytest.mark.fuzz
+def test_names_that_would_leave_a_folder_are_refused():
+    for name in (*BAD_NAMES, 3, None, ["a"]):
+        assert refuse_name(name), name
+    for name in ("a", "a/b", "2013_05_28_drive_0003_sync/0000000000", "..a", "ü 1"):
+        assert refuse_name(name) is None

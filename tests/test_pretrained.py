@@ -14,9 +14,6 @@ from r3dpa import SceneGenerator, SceneVAE, pretrained
 from r3dpa.checkpoints import convert, load_into, read_checkpoint
 from r3dpa.cli import main
 from r3dpa.cli.scene_files import written
-from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
-
-GEOMETRY = ScanGeometry(SphericalProjection(LidarSensor(16, 64)), RangeCodec(), (2, 8))
 
 
 @pytest.fixture
@@ -24,7 +21,7 @@ def shipped(tmp_path, monkeypatch):
     """Folder of shipped weights with one name, ``tiny``."""
     folder = tmp_path / "weights"
     folder.mkdir()
-    tiny_checkpoint(folder / "tiny.safetensors", GEOMETRY)
+    tiny_checkpoint(folder / "tiny.safetensors")
     (folder / "tiny.md").write_text("# tiny: the card\n")
     monkeypatch.setattr(pretrained, "_FOLDER", folder)
     return folder

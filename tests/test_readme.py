@@ -11,7 +11,6 @@ from tiny_networks import tiny_checkpoint
 
 from r3dpa import pretrained
 from r3dpa.data import write_bin
-from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
 
 TOP = Path(__file__).resolve().parents[1]
 README = TOP / "README.md"
@@ -33,9 +32,8 @@ ANSWERS = {
 
 
 def test_python_of_the_readme_runs(tmp_path, monkeypatch):
-    geometry = ScanGeometry(SphericalProjection(LidarSensor(16, 64)), RangeCodec(), (2, 8))
     monkeypatch.setattr(pretrained, "_FOLDER", tmp_path)
-    tiny_checkpoint(tmp_path / "r3dpa-s.safetensors", geometry)
+    tiny_checkpoint(tmp_path / "r3dpa-s.safetensors")
     points = np.random.default_rng(0).normal(size=(4000, 4)).astype(np.float32) * 10
     points[:, 3] = 0.5
     for place in ("scan.bin", "scans/0.bin", "runs/demo/scenes/bin/0.bin"):

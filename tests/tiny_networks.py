@@ -7,8 +7,10 @@ from pathlib import Path
 import torch
 
 from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint
+from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
 from r3dpa.nn import VAE, AverageVelocitySiT, LatentNorm, SiT, ThinDecoder
 
+GEOMETRY = ScanGeometry(SphericalProjection(LidarSensor(16, 64)), RangeCodec(), (2, 8))
 VAE_ARGS = {"latent_channels": 4, "channels": 32, "num_res_blocks": 1}
 VAE_ARGS |= {"channel_multipliers": [1, 1, 1], "strides": [[2, 2], [2, 2]]}
 SIT_ARGS = {"input_size": [4, 16], "in_channels": 4, "hidden_size": 32, "depth": 2, "num_heads": 2}
@@ -29,7 +31,7 @@ def tiny_networks(spread=0.1, vae_args=VAE_ARGS, **sit_args):
 
 
 def tiny_checkpoint(
-    path, geometry, spread=0.1, sit_args=None, stage="joint", vae_args=VAE_ARGS, **fields
+    path, geometry=GEOMETRY, spread=0.1, sit_args=None, stage="joint", vae_args=VAE_ARGS, **fields
 ):
     """Checkpoint of a stage for inference, of :func:`tiny_networks`."""
     if stage == "few_step":

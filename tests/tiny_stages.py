@@ -214,3 +214,23 @@ def guarded(stage, bad=(), fault=infinite_image, numbers=None, **kwargs):
     module = stage_module(stage, **kwargs)
     module.__class__ = Module
     return module
+
+
+# Which loss reaches which parts of the networks.
+ENCODER, DECODER = {"vae.encoder", "vae.quant_conv"}, {"vae.decoder", "vae.post_quant_conv"}
+DISCRIMINATOR = {"discriminator.main"}
+ALIGNED = {"sit.x_embedder", "sit.t_embedder", "sit.y_embedder", "sit.blocks.0"}
+REST = {"sit.blocks.1", "sit.final_layer"}
+PROJECTOR = {"sit.projector"}
+VAE_LOSSES = {"reconstruction": ENCODER | DECODER, "kl": ENCODER}
+VAE_LOSSES |= {"adversarial": ENCODER | DECODER, "discriminator": DISCRIMINATOR}
+SIT_LOSSES = {"denoising": ALIGNED | REST, "sit_alignment": ALIGNED | PROJECTOR}
+REACH = {
+    "vae_alignment": VAE_LOSSES | {"vae_alignment": ENCODER | PROJECTOR | {"sit.x_embedder"}},
+    "joint": VAE_LOSSES | SIT_LOSSES | {"vae_alignment": ENCODER},
+    "flow_matching": SIT_LOSSES,
+    "few_step": {
+        "denoising": {"sit.average"},
+        "reconstruction": {"thin_decoder.decoder", "thin_decoder.post_quant_conv"},
+    },
+}

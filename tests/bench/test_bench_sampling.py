@@ -26,10 +26,7 @@ from r3dpa.bench.sampling import (
 from r3dpa.checkpoints import read_checkpoint
 from r3dpa.cli import main
 from r3dpa.generation import SamplerConfig
-from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
 
-SENSOR = LidarSensor(beams=16, columns=64, range_min_m=2.0, range_max_m=40.0)
-GEOMETRY = ScanGeometry(SphericalProjection(SENSOR), RangeCodec(), (2, 8))
 TINY = Effort(samples=4, reference_steps=16, evaluations=(2, 4), rounds=2, batch=2)
 MIXTURE = GaussianMixture(torch.eye(3, dtype=torch.float64), 0.5, torch.ones(3))
 
@@ -38,7 +35,7 @@ MIXTURE = GaussianMixture(torch.eye(3, dtype=torch.float64), 0.5, torch.ones(3))
 def ckpt(tmp_path_factory):
     path = tmp_path_factory.mktemp("ckpt") / "tiny.safetensors"
     guided = {"perturbed_attention": {"block": 1, "scale": 1.5}}  # which is not measured
-    return tiny_checkpoint(path, GEOMETRY, stage="few_step", step=7, sampling=guided)
+    return tiny_checkpoint(path, stage="few_step", step=7, sampling=guided)
 
 
 @pytest.fixture(scope="module")

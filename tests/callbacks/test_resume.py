@@ -75,6 +75,7 @@ def whole(tmp_path_factory):
         *((5, 3, 3), (5, 5, 5000)),
     ],
 )
+@pytest.mark.numerics("resume in the middle")
 def test_a_resumed_run_is_exact_also_at_the_end_of_an_epoch(
     stop, every, val_every, whole, tmp_path
 ):

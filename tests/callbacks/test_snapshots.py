@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from tiny_networks import SIT_ARGS, VAE_ARGS
+from tiny_networks import GEOMETRY, SIT_ARGS, VAE_ARGS
 
 from r3dpa.callbacks import EMASnapshots
 from r3dpa.checkpoints import (
@@ -20,13 +20,9 @@ from r3dpa.checkpoints import (
 )
 from r3dpa.cli import main
 from r3dpa.flow.autoguidance import renormalised
-from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
+from r3dpa.geometry import ScanGeometry
 from r3dpa.modules import FlowMatching, VAEAlignment
 from r3dpa.nn import VAE, LatentNorm, PatchDiscriminator, SiT
-
-GEOMETRY = ScanGeometry(
-    SphericalProjection(LidarSensor(beams=16, columns=64)), RangeCodec(), (2, 8)
-)
 
 
 def module(kind=FlowMatching, **more):
@@ -158,7 +154,7 @@ def test_a_resumed_run_replaces_what_an_abandoned_one_left_after_its_checkpoint(
     assert second.read_bytes() == before
 
 
-def test_what_cannot_be_written_is_refused_before_training(tmp_path):
+def test_networks_built_by_hand_and_endless_trainings_get_no_snapshots(tmp_path):
     by_hand = module()
     by_hand.hparams["sit"] = by_hand.sit
     with pytest.raises(ValueError, match="built by hand"):
@@ -250,7 +246,7 @@ def test_channels_that_scale_apart_are_refused_beyond_the_tolerance(pair, varian
         read_snapshot(path, strong)
 
 
-def test_another_vae_is_refused(pair):
+def test_a_snapshot_of_another_vae_is_refused(pair):
     """As in stage joint, whose VAE trains on after the snapshot."""
     path, strong = pair
     vae = strong.network("vae")

@@ -44,7 +44,9 @@ class TestABadStep:
         ("stage", "fault", "accumulate"),
         [*((*fault, 1) for fault in FAULTS), ("joint", infinite_image, 2)],
     )
-    def test_is_as_if_it_had_not_been(self, stage, fault, accumulate):
+    def test_a_skipped_step_leaves_weights_averages_and_moments_alone(
+        self, stage, fault, accumulate
+    ):
         """Weights, all buffers, averages and moments equal those of a run without its batches.
 
         With two batches a step the second one of the middle step is broken; both are then lost.
@@ -75,7 +77,7 @@ class TestABadStep:
 
 
 class TestTheReport:
-    def test_names_the_scans_and_keeps_the_batch(self, tmp_path):
+    def test_a_skipped_step_names_its_scans_and_saves_the_batch(self, tmp_path):
         module = guarded("joint", [1])
         data = NamedData(3)
         with pytest.warns(UserWarning, match="step 1 was skipped") as caught:
@@ -92,7 +94,7 @@ class TestTheReport:
         assert saved["weights"] == asdict(module.weights) | {"adversarial_start": -1}
         assert not math.isfinite(saved["losses"]["loss"])
 
-    def test_of_two_batches_of_a_step_only_the_broken_one_is_kept(self, tmp_path):
+    def test_the_broken_one_of_two_batches_of_a_step_is_saved(self, tmp_path):
         train(
             guarded("joint", [1]),
             NamedData(2),
@@ -103,7 +105,7 @@ class TestTheReport:
         (file,) = (tmp_path / "bad_batches").iterdir()
         assert file.name == "step_0000000_batch_0000001_rank_0.pt"
 
-    def test_keeps_a_few_batches_at_most(self, tmp_path):
+    def test_at_most_a_few_bad_batches_are_saved(self, tmp_path):
         module = guarded("joint", range(4))
         train(module, NamedData(5), StepGuard(saved_batches=2), default_root_dir=tmp_path)
         assert module.guard.skipped == 4
@@ -118,7 +120,7 @@ class TestTheReport:
             train(guarded("joint", [0]), NamedData(2), default_root_dir=tmp_path)
 
     @pytest.mark.parametrize("content", [b"", b"{}", {}, {"stage": "joint"}])
-    def test_another_file_is_refused_by_name(self, content, tmp_path):
+    def test_a_file_that_is_no_saved_batch_is_refused_by_name(self, content, tmp_path):
         path = tmp_path / "step.pt"
         if isinstance(content, bytes):
             path.write_bytes(content)
@@ -178,14 +180,14 @@ class TestScaledLosses:
     """Float16 scales the losses up and looks for a scale at which no gradient overflows."""
 
     @pytest.mark.parametrize("norms", [[1.0, torch.inf], [torch.nan, 1.0]])
-    def test_gradients_that_overflow_are_the_business_of_the_scale(self, norms):
+    def test_gradients_that_overflow_by_the_loss_scale_do_not_count_as_bad_in_a_row(self, norms):
         guard, skipped, _ = checked(norms, scaler=SimpleNamespace(get_scale=lambda: 65536.0))
         assert (skipped, guard.skipped, guard.in_a_row) == (True, 1, 0)
 
     @pytest.mark.parametrize(
         "fault", [{"scale": 1.0}, {"loss": torch.nan}, {"buffer": torch.inf}, {"loss": torch.inf}]
     )
-    def test_another_fault_is_not(self, fault):
+    def test_a_fault_that_no_scale_mends_counts_as_bad_in_a_row(self, fault):
         scale = fault.pop("scale", 65536.0)
         scaler = SimpleNamespace(get_scale=lambda: scale)
         guard, skipped, _ = checked([torch.inf], scaler=scaler, **fault)
@@ -218,7 +220,7 @@ class TestScaledLosses:
             self.fit(20, 8.0, bad=range(20), fault=infinite_gradient)
 
 
-def test_a_step_passes_on_who_asks_to_stop():
+def test_a_step_passes_a_stop_signal_on():
     guard = StepGuard()
     for norm in (1.0, torch.nan):
         guard.stop = 15
@@ -253,7 +255,7 @@ def test_a_bad_batch_of_one_process_skips_the_step_of_all(tmp_path, one_thread):
 
 
 @pytest.mark.ddp
-def test_a_process_that_is_asked_to_stop_tells_the_other_in_its_step(tmp_path, one_thread):
+def test_a_process_with_a_stop_signal_tells_the_other_in_its_step(tmp_path, one_thread):
     """The second process gets a signal in its second step; both know after that step."""
 
     class Ask(L.Callback):

@@ -103,7 +103,7 @@ class TestSimulate:
             (["--weather.rain_mm_h", "-1"], "^rain_mm_h must be 0 or greater, got -1"),
         ],
     )
-    def test_wrong_words_are_named(self, simulate, words, message, tmp_path):
+    def test_wrong_options_of_simulate_are_named(self, simulate, words, message, tmp_path):
         with pytest.raises(ValueError, match=message):
             simulate(*words)
         assert not (tmp_path / "out").exists()
@@ -167,7 +167,7 @@ class TestCheck:
             ("texts/a.csv", "a.csv: is of no known format; can be read: .bin, "),
         ],
     )
-    def test_what_can_be_read_is_said(self, name, says, tmp_path, capsys):
+    def test_formats_that_can_be_read_are_said(self, name, says, tmp_path, capsys):
         (tmp_path / "empty").mkdir()
         (tmp_path / "texts").mkdir()
         (tmp_path / "texts/a.csv").write_text("1,2,3")
@@ -223,7 +223,7 @@ class TestObjects:
             assert name in text
         assert "4 scans" in text
 
-    def test_another_kind_of_file_is_refused(self, simulated, tiny_file, tmp_path):
+    def test_an_object_library_of_another_format_is_refused(self, simulated, tiny_file, tmp_path):
         with pytest.raises(ValueError, match=r"\.safetensors file, got .*objects\.npz"):
             objects(data=str(simulated), ckpt=tiny_file, out=tmp_path / "objects.npz")
 
@@ -300,7 +300,7 @@ class TestView:
             self.show(drive, tmp_path / "out")
         assert not (tmp_path / "out").exists()
 
-    def test_of_a_folder_scans_are_spread_evenly(self, tmp_path, monkeypatch, capsys):
+    def test_shown_scans_are_spread_evenly_over_a_folder(self, tmp_path, monkeypatch, capsys):
         """The default folder is named after the source."""
         monkeypatch.chdir(tmp_path)
         for number in range(10):

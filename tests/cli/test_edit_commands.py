@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from tiny_networks import tiny_checkpoint
+from tiny_networks import GEOMETRY, tiny_checkpoint
 
 from lidarsim import simulate
 from lidarsim.clouds import read_cloud
@@ -15,22 +15,17 @@ from r3dpa.cli import edit_session, main
 from r3dpa.data import read_scan, write_bin, write_npz, write_ply
 from r3dpa.editing import SceneEditor
 from r3dpa.geometry import (
-    LidarSensor,
-    RangeCodec,
-    ScanGeometry,
-    SphericalProjection,
     points_of,
     range_image,
 )
 
-SENSOR = LidarSensor(beams=16, columns=64)
-PROJECTION = SphericalProjection(SENSOR)
+PROJECTION = GEOMETRY.projection
+SENSOR = PROJECTION.sensor
 
 
 def checkpoint(folder, feature_source="geometric"):
     return tiny_checkpoint(
         folder / f"{feature_source}.safetensors",
-        ScanGeometry(PROJECTION, RangeCodec(), (2, 8)),
         spread=0.05,
         sit_args={"feature_dim": 16},
         feature_source=feature_source,
@@ -247,11 +242,6 @@ REFUSED = [
     ("vary", "--scan tilted.bin", r"tilted.bin: .*outside the field"),
     ("vary", "--scan two.npz", r"holds 2 scans \(x, y\)"),
     ("vary", "--scan gone.bin", "gone.bin"),
-    (
-        "mix",
-        "--ckpt None.safetensors --left a.bin --right b.bin",
-        "None.safetensors was trained without 3D features",
-    ),
     ("interpolate", "--left a.bin --right b.bin --frames 1", "at least 2"),
 ]
 

@@ -175,7 +175,7 @@ def test_official_weights_are_given_by_space(data, no_figures, samples, tmp_path
         (["--split", "val"], r"reference\.safetensors: .*the split val does not apply"),
     ],
 )
-def test_wrong_options_are_named(reference_file, samples, words, message):
+def test_wrong_options_of_evaluate_are_named(reference_file, samples, words, message):
     options = ["--samples", samples, "--reference", reference_file]
     with pytest.raises(ValueError, match=message):
         evaluate(*options, *words)

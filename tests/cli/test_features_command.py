@@ -1,6 +1,6 @@
 """``r3dpa data features`` from the outside: forms of the command, refusals, several processes.
 
-Interrupts and kills are in tests/faults.
+Interrupts and kills are in test_faults_of_writers.py.
 """
 
 import subprocess

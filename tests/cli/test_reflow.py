@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from test_baselines import fit_words
+from tiny_baselines import fit_words
 
 from lidarsim import simulate
 from r3dpa.baselines import ReflowPairs

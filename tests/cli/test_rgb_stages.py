@@ -94,7 +94,7 @@ def test_the_vae_is_frozen_and_the_sit_trained_and_resumed_exactly(image_vae, rg
         assert torch.equal(value, resumed["state_dict"][key]), key
 
 
-def test_vae_alignment_starts_from_it(rgb, smoke_args, tmp_path, caplog):
+def test_vae_alignment_starts_from_an_rgb_model(rgb, smoke_args, tmp_path, caplog):
     """With the blocks, on another grid; the projector is fresh."""
     more = ["--model.init_args.optimizer.lr=0", "--model.init_args.keep_projector=false"]
     more += [f"--model.init_args.rgb_weights={rgb}", "--trainer.logger=false"]
@@ -158,7 +158,7 @@ def test_a_teacher_is_moved_to_the_images():
         ({"data.init_args.image_size": 32}, r"give \(16, 16\) latents"),
     ],
 )
-def test_what_does_not_fit_is_said(settings, message, tmp_path, capsys):
+def test_settings_that_do_not_fit_are_said(settings, message, tmp_path, capsys):
     with pytest.raises((ValueError, SystemExit)) as stop:
         fit(tmp_path, RGB, LEAVES, VAE, TINY, steps(1), settings)
     assert re.search(message, str(stop.value) + capsys.readouterr().err)

@@ -135,7 +135,7 @@ def test_a_reference_knows_its_scans_from_others_of_their_names(reference, smoke
         (["--scorer.protocol=published"], "the reference is of the protocol default, not publi"),
     ],
 )
-def test_what_does_not_fit_is_said_before_scenes_are_sampled(
+def test_a_reference_that_does_not_fit_is_said_before_scenes_are_sampled(
     options, message, reference, words, tmp_path, monkeypatch
 ):
     monkeypatch.setattr(SceneScorer, "_sample", lambda *_: pytest.fail("has sampled"))

@@ -175,7 +175,7 @@ CHANGES = {
 
 
 @pytest.mark.parametrize("name", CHANGES)
-def test_what_has_changed_is_made_again(pair, tmp_path, capsys, name):
+def test_scans_and_results_that_have_changed_are_made_again(pair, tmp_path, capsys, name):
     source, out = pair
     CHANGES[name](source, out)
     capsys.readouterr()

@@ -128,7 +128,7 @@ def test_held_out_folders_and_limit(tmp_path, make_scans, sensor):
         LidarDataModule(str(tmp_path / "scans"), val_drives=["city/c"]).split()
 
 
-def test_official_split(tmp_path, make_scans, sensor):
+def test_the_official_split_names_its_drives(tmp_path, make_scans, sensor):
     extra = "2013_05_28_drive_0008_sync"  # recorded for a benchmark, part of no split
     for seed, drive in enumerate([*KITTI360_DRIVES["train"], *KITTI360_DRIVES["val"], extra]):
         make_scans(tmp_path / "data_3d_raw" / drive / "velodyne_points/data", 2, seed)
@@ -176,7 +176,7 @@ def test_rings_do_not_depend_on_the_limit(tmp_path):
 
 
 @pytest.mark.parametrize("part", ["train", "val"])
-def test_one_split_alone(tmp_path, make_scans, sensor, part, fit, trainer, recorder):
+def test_a_split_can_be_loaded_alone(tmp_path, make_scans, sensor, part, fit, trainer, recorder):
     """KITTI-360 with drives of one split: usable but for the stage that needs the other one."""
     drive = KITTI360_DRIVES[part][0]
     make_scans(tmp_path / "data_3d_raw" / drive / "velodyne_points/data", 4)
@@ -218,9 +218,14 @@ def test_grids_of_a_single_file_need_a_folder(tmp_path, data, sensor, scaled_poi
         ({"seed": -1}, "seed must be at least 0"),
     ],
 )
-def test_bad_arguments(data, options, message):
+def test_bad_arguments_are_refused(data, options, message):
     with pytest.raises(ValueError, match=message):
         data(**options)
+
+
+def test_a_sensor_by_its_name_is_refused():
+    with pytest.raises(ValueError, match=r"sensor must be a LidarSensor .* got 'hdl32e'"):
+        LidarDataModule(scans="scans", sensor="hdl32e")
 
 
 def test_simulated_data_are_made_once_and_feed_a_fit(tmp_path, scaled_points, fit):

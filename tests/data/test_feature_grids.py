@@ -246,7 +246,9 @@ def test_features_that_are_not_finite_name_the_scan(made, projection, scaled_poi
 @pytest.mark.parametrize(
     ("sizes", "message"), [([], "grid_sizes is empty"), ([GRID, (3, 4)], "3 x 4 cells does not")]
 )
-def test_bad_grid_sizes(tmp_path, folder, projection, scaled_points, sizes, message):
+def test_grid_sizes_that_do_not_divide_the_image_are_refused(
+    tmp_path, folder, projection, scaled_points, sizes, message
+):
     with pytest.raises(ValueError, match=message):
         write_feature_grids(find_scans(folder), scaled_points(), projection, sizes, tmp_path / "g")
 

@@ -145,7 +145,7 @@ def test_the_crop_is_the_centre():
     assert center_crop(Image.fromarray(pixels), 7).shape == (7, 7, 3)
 
 
-def test_splits_mirrors_and_range(folder):
+def test_images_are_split_mirrored_and_scaled(folder):
     module = ImageDataModule(
         ImageFolder(str(folder)), image_size=8, batch_size=2, val_every=4, mirrored=True
     )

@@ -39,6 +39,7 @@ def of_all_ranks(num_replicas, batch_size, count, epoch, state=None):
 
 
 @pytest.mark.parametrize("count", [64, 70, 79])
+@pytest.mark.numerics("recompilation at the last batch")
 def test_global_batches_do_not_depend_on_the_number_of_processes(count):
     one, two, four = (of_all_ranks(processes, 8, count, epoch=3) for processes in (1, 2, 4))
     assert one == two == four

@@ -1,6 +1,8 @@
+import io
 import json
 import os
 import struct
+import zipfile
 
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from lidarsim.scan_files import (
     write_npz,
     write_ply,
 )
+from r3dpa.data import read_samples
 from r3dpa.data.scans import KITTI360_DRIVES, check, find_scans, kitti360_scans
 from r3dpa.geometry import LidarSensor
 from r3dpa.io import atomic_path, refuse_name
@@ -175,7 +178,7 @@ def test_pipes_and_devices_are_not_read(tmp_path):
 
 
 @pytest.mark.parametrize("width", [3, 4])
-def test_round_trips(tmp_path, width):
+def test_written_scans_come_back(tmp_path, width):
     points = POINTS[:, :width]
     write_bin(tmp_path / "new/a.bin", points)
     expected = np.concatenate([POINTS[:, :3], POINTS[:, 3:] * (width == 4)], 1)
@@ -303,7 +306,7 @@ def make_kitti360(root, make_scans, drives):
         make_scans(root / "data_3d_raw" / drive / "velodyne_points/data", 2, seed)
 
 
-def test_official_layout(tmp_path, make_scans):
+def test_scans_in_the_official_layout_are_found(tmp_path, make_scans):
     drives = KITTI360_DRIVES["train"] + KITTI360_DRIVES["val"]
     make_kitti360(tmp_path, make_scans, drives)
     make_scans(tmp_path / "data_3d_raw" / drives[0] / "sick_points/data", 1)  # another sensor
@@ -376,3 +379,44 @@ def test_real_scans(real_scans_dir):
         "udacity_sfnd/data_2: 11 scans",
     ]
     assert not problems(real_scans_dir)
+
+
+@pytest.mark.fuzz
+def test_a_member_of_an_archive_must_have_a_plain_name(tmp_path):
+    array = io.BytesIO()
+    np.save(array, POINTS)
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        archive.writestr("../../x.npy", array.getvalue())
+    with pytest.raises(ValueError, match=r"a\.npz, member .*\(its name"):
+        read_npz(tmp_path / "a.npz")
+    with pytest.raises(ValueError, match=r"a\.npz, member .*\(its name"):
+        list(read_samples(tmp_path / "a.npz", LidarSensor(4, 16)))
+
+
+@pytest.mark.fuzz
+@pytest.mark.parametrize("count", [2**40, 2**62])
+def test_an_array_that_claims_more_than_the_file_holds_is_refused(tmp_path, count):
+    head = f"{{'descr': '<f4', 'fortran_order': False, 'shape': ({count}, 4)}}"
+    data = b"\x93NUMPY\x01\x00\x76\x00" + head.encode().ljust(117) + b"\n" + bytes(64)
+    (tmp_path / "a.npy").write_bytes(data)
+    with pytest.raises(ValueError, match=r"a\.npy: cannot be read as an array"):
+        list(read_samples(tmp_path / "a.npy", LidarSensor(4, 16)))
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        archive.writestr("a.npy", data)
+    with pytest.raises(ValueError, match=r"a\.npz, member 'a\.npy': is damaged"):
+        read_npz(tmp_path / "a.npz")
+
+
+@pytest.mark.fuzz
+@pytest.mark.parametrize(("num_members", "claim"), [(1, 2**31), (4, 2**27)])
+def test_an_archive_that_claims_more_than_it_holds_is_refused(tmp_path, num_members, claim):
+    """One member alone, or all members together."""
+    np.savez(tmp_path / "a.npz", *[POINTS] * num_members)
+    data = bytearray((tmp_path / "a.npz").read_bytes())
+    size = 0
+    for _ in range(num_members):
+        size = data.index(b"PK\x01\x02", size) + 24  # of the unpacked size
+        data[size : size + 4] = claim.to_bytes(4, "little")
+    (tmp_path / "a.npz").write_bytes(data)
+    with pytest.raises(ValueError, match=r"a\.npz: .*larger than the file"):
+        read_npz(tmp_path / "a.npz")

@@ -101,7 +101,7 @@ def test_wrong_shapes_and_unwritable_folders_are_named(halves, tmp_path):
 
 
 @pytest.mark.parametrize("value", [torch.inf, torch.nan])
-def test_what_is_not_finite_is_not_kept(halves, value):
+def test_rows_that_are_not_finite_are_not_stored(halves, value):
     """It would cost a step in every epoch; the rows before it stay."""
     tensors = torch.zeros(5, *SHAPE)
     tensors[3, 1, 2] = value
@@ -306,3 +306,24 @@ def test_reading_copies_one_row_only(tmp_path, dtype):
     assert len(data) < 50_000  # the names, not the rows
     copy = pickle.loads(data)  # noqa: S301 - made two lines above
     assert torch.equal(copy.read(given[7]), torch.ones(8, 512))
+
+
+@pytest.mark.faults
+@pytest.mark.parametrize("opened", [False, True])
+@pytest.mark.parametrize("num_bytes", [None, 0, 100])
+def test_rows_that_are_cut_after_the_journal_was_read_are_named(opened, num_bytes, halves):
+    """Without the check, the system kills whoever touches what is no longer there (SIGBUS)."""
+    fill(halves, (0, 8))
+    tensors = CachedTensors(halves, items(0, 8))
+    if opened:
+        tensors.read(*items(7, 8))
+    path = halves.folder / "shard_00000.rows"
+    if num_bytes is None:
+        path.unlink()
+    else:
+        os.truncate(path, num_bytes)
+    if opened and num_bytes is None:  # the system keeps what is open
+        assert torch.equal(tensors.read(*items(7, 8)), tensor_of(*items(7, 8)).half().float())
+        return
+    with pytest.raises(StoreError, match=f"{path} .*with a command"):
+        tensors.read(*items(7, 8))

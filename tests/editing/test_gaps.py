@@ -51,7 +51,7 @@ class TestInterpolation:
             errors[how] = ((made - range_m).abs() / range_m)[4:15].max().item()
         assert errors["inverse"] < 1e-3 < errors["linear"] < errors["nearest"]
 
-    def test_by_hand(self):
+    def test_interpolation_between_beams_by_hand(self):
         range_m = torch.full((16, 64), -1.0)
         range_m[0], range_m[4], range_m[8] = 10.0, 40.0, -1.0
         missing = rows_missing(4)
@@ -96,7 +96,7 @@ class TestBlend:
         assert (without[missing] == -1).all()
         assert (without[~missing] == 10).all()
 
-    def test_at_an_edge_it_is_the_mean_of_both_within_the_neighbours(self):
+    def test_an_edge_is_the_mean_of_generated_and_interpolated_ranges(self):
         """Between 10 and 30 m: 15 m halfway in 1 / range; 12 m lie between them, 50 m do not."""
         range_m, missing = torch.full((16, 64), 10.0), rows_missing(2)
         range_m[2:] = 30.0
@@ -114,12 +114,12 @@ class TestBlend:
         edge = self.blend(10.0, range_m, missing)[1]
         torch.testing.assert_close(edge, torch.full((64,), expected))
 
-    def test_where_interpolation_has_nothing_it_is_as_generated(self):
+    def test_pixels_without_interpolation_are_as_generated(self):
         range_m, missing = torch.full((16, 64), -1.0), rows_missing(2)
         assert (self.blend(12.0, range_m, missing)[1] == 12).all()
 
 
-def test_themedian_draw_has_a_return_where_half_of_them_have():
+def test_the_median_draw_has_a_return_where_half_of_the_draws_have():
     range_m = torch.tensor([[[1.0, 2.0, -1.0]], [[5.0, -1.0, -1.0]], [[3.0, 4.0, 9.0]]])
     classes = torch.arange(9).view(3, 1, 3)
     median = median_draw(Pixels(range_m, None, classes))
@@ -182,11 +182,11 @@ class TestView:
         ],
         ids=["looks up", "looks ahead only", "part of a turn", "fewer beams"],
     )
-    def test_others_are_refused_with_the_numbers(self, points, message):
+    def test_scans_of_another_view_are_refused_with_the_numbers(self, points, message):
         with pytest.raises(ValueError, match=message):
             self.check(points)
 
-    def test_limits_of_each_refusal(self):
+    def test_scans_just_beyond_a_limit_are_refused(self):
         """Just beyond each of them; the table of refusals above has cases far beyond."""
         outside = torch.cat([cloud(10, 20, beams=16), cloud(-24, 2.0, beams=48)])  # 25 %
         with pytest.raises(ValueError, match="25% of the points lie outside"):
@@ -220,7 +220,7 @@ class TestView:
         with pytest.raises(ValueError, match="outside the field of view"):
             check_view(points, range_m, PROJECTION)
 
-    def test_what_is_missing_need_not_be_interpolate_gaps(self):
+    def test_a_missing_sector_needs_no_returns(self):
         missing = torch.ones(16, 64, dtype=torch.bool)
         missing[:, 24:40] = False  # 90 degrees ahead
         self.check(cloud(-24.5, 2.5, azimuths_deg=(-50, 50)), missing)

@@ -183,7 +183,7 @@ def test_other_objects_and_features_of_another_source_are_refused(library):
             library.check_source(source, dim)
 
 
-def test_what_the_scans_do_not_show_is_refused(tmp_path, scaled_points):
+def test_objects_that_no_scan_shows_are_refused(tmp_path, scaled_points):
     scans = [write_scan(tmp_path, "0", [AHEAD, FAR], [CAR, ROAD])]
 
     def make(extractor=None):

@@ -224,7 +224,7 @@ class TestScans:
             (torch.zeros(0, 3), "no point within"),
         ],
     )
-    def test_what_is_no_scan_is_refused(self, editor, scan, message):
+    def test_points_and_images_that_are_no_scan_are_refused(self, editor, scan, message):
         with pytest.raises(ValueError, match=message):
             editor.encode(scan)
 

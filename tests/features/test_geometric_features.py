@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from r3dpa.features import GeometricFeatures
-from r3dpa.features.geometric import _BANDWIDTH, CENTRES, SPREADS
+from r3dpa.features.geometric import CENTRES, SPREADS
 
 LINEARITY, PLANARITY, SPHERICITY, ALONG, ACROSS, UP, HEIGHT, LOG_RANGE, INTENSITY = range(9)
 
@@ -134,15 +134,15 @@ def test_turned_and_mirrored_scans_have_the_same_features(extractor):
 
 
 def test_features_have_unit_norm_and_follow_the_kernel():
-    # Inner products are a Gaussian kernel of the standardised descriptors, up to the error of 32
-    # random frequencies (standard deviation below 1 / sqrt(2 * 32) = 0.125).
+    # Inner products are a Gaussian kernel, of width 2, of the standardised descriptors, up to the
+    # error of 32 random frequencies (standard deviation below 1 / sqrt(2 * 32) = 0.125).
     extractor = GeometricFeatures(dim=128)
     points = torch.cat([wall(), ground(), pole(), foliage()])
     points = points[torch.randperm(len(points), generator=torch.Generator().manual_seed(1))[:300]]
     features = extractor(points)
     assert torch.allclose(features.norm(dim=1), torch.ones(300), atol=1e-5)
     standard = (extractor.descriptors(points) - torch.tensor(CENTRES)) / torch.tensor(SPREADS)
-    expected = torch.exp(-(torch.cdist(standard, standard) ** 2) / (2 * _BANDWIDTH**2))
+    expected = torch.exp(-(torch.cdist(standard, standard) ** 2) / (2 * 2**2))
     error = features @ features.T - expected
     assert error.square().mean().sqrt() < 0.125
 

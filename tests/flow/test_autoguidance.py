@@ -36,14 +36,14 @@ def constant(time, batch=3):
 
 
 @pytest.mark.parametrize("scale", [1.5, 4.0])
-def test_it_goes_beyond_the_model_by_scale_minus_one_differences(scale):
+def test_autoguidance_adds_scale_minus_one_differences(scale):
     x, time = points(), torch.tensor([0.1, 0.5, 0.9], dtype=torch.float64)
     difference = strong(x, time) - weak(x, time)
     expected = strong(x, time) + (scale - 1) * difference
     torch.testing.assert_close(autoguided(strong, weak, scale)(x, time), expected)
 
 
-def test_scale_one_is_the_model_and_never_asks_the_weak_one():
+def test_autoguidance_of_scale_one_is_the_model_and_never_runs_the_weak_one():
     counted = Mock(wraps=weak)
     x = points()
     result = heun(autoguided(strong, counted, 1.0), x, ode_times(4))
@@ -87,7 +87,7 @@ def test_a_difference_of_bfloat16_models_is_magnified_in_float32():
     assert (found == 1 + 1.5 * 2**-7).all()
 
 
-def test_what_does_not_fit_is_refused():
+def test_scales_intervals_and_shapes_that_do_not_fit_are_refused():
     for scale in (0.99, 0.0, -1.0, math.inf, math.nan):
         with pytest.raises(ValueError, match=f"1 or more, got {scale}"):
             autoguided(strong, weak, scale)
@@ -136,7 +136,7 @@ def test_another_normalisation_gives_the_velocity_of_the_same_data(path, scale, 
 
 
 @pytest.mark.parametrize("path", ["linear", "cosine"])
-def test_it_is_finite_at_both_ends(path):
+def test_a_renormalised_model_is_finite_at_both_ends(path):
     """At t = 1 nothing is left of the data: the weak model sees the same noise at time 1."""
     seen = []
 
@@ -154,6 +154,6 @@ def test_it_is_finite_at_both_ends(path):
     torch.testing.assert_close(torch.stack([at_data[0], at_noise[0]]), torch.arange(2.0).double())
 
 
-def test_the_same_normalisation_is_left_alone():
+def test_a_model_of_the_same_normalisation_is_left_alone():
     assert renormalised(weak, 1.0, torch.zeros(2)) is weak
     assert renormalised(weak, 1.0, SHIFT) is not weak

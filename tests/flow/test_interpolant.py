@@ -129,3 +129,31 @@ def test_sampled_times_repeat_with_the_generator(kind):
     assert torch.equal(first, sample_time(4, kind, generator=torch.Generator().manual_seed(3)))
     torch.manual_seed(3)
     assert torch.equal(first, sample_time(4, kind))
+
+
+DTYPES = [torch.float32, torch.bfloat16, torch.float16]
+
+
+def unit_roundoff(dtype):
+    return torch.finfo(dtype).eps / 2
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.numerics("score near the data")
+def test_rounding_of_the_velocity_is_not_divided_by_time(dtype):
+    """With data d and noise n the score is -n / t exactly, and t score never needs the division."""
+    generator = torch.Generator().manual_seed(0)
+    data, noise = torch.randn(2, 8, 256, generator=generator, dtype=torch.float64)
+    times = torch.logspace(0, -7, 8, dtype=torch.float64)
+    path = Interpolant()
+    x, velocity = path.interpolate(data, noise, times), path.target(data, noise, times)
+    answer = velocity.to(dtype)  # what a network in this precision gives
+    drift = path.sde_drift(answer, x.float(), times.float()).double()
+    drift_error = (drift - path.sde_drift(velocity, x, times)).abs().amax(dim=1)
+    bound = 2 * unit_roundoff(dtype) * velocity.abs().max() + 8 * unit_roundoff(torch.float32)
+    assert (drift_error <= bound).all()
+    assert path.sde_drift(answer[:1], x[:1].float(), torch.zeros(1)).isfinite().all()
+
+    score = path.score(answer, x, times)
+    score_error = (score + noise / times[:, None]).abs().amax(dim=1)
+    assert score_error[-1] > 1e5 * drift_error.max()

@@ -9,6 +9,7 @@ import pytest
 import torch
 from velocities import gaussian_velocity, growth, standard_noise, still
 
+from r3dpa.bench.problems import GaussianMixture
 from r3dpa.flow.interpolant import Interpolant
 from r3dpa.flow.sampler import SamplerConfig, Solver
 from r3dpa.flow.solvers import (
@@ -18,6 +19,7 @@ from r3dpa.flow.solvers import (
     euler,
     evaluations,
     heun,
+    midpoint,
     ode_solver,
     steps_for,
     unipc,
@@ -104,6 +106,7 @@ def test_order_from_end_to_end(solver, order, ends, path):
 
 @pytest.mark.parametrize(("solver", "degree"), [(ab2, 1), (ab3, 2)])
 @pytest.mark.parametrize("flip", [False, True])
+@pytest.mark.numerics("multistep solver on unequal steps")
 def test_adams_bashforth_integrates_polynomials_on_uneven_grids(solver, degree, flip):
     """Once its history is full; what the first steps, of lower order, add is subtracted."""
     times = UNEVEN.flip(0) if flip else UNEVEN
@@ -250,6 +253,7 @@ def test_unknown_solvers_and_counts_are_refused(call, message):
 
 @pytest.mark.parametrize("solver", ODE_SOLVERS)
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.bfloat16])
+@pytest.mark.numerics("state in half precision")
 def test_state_keeps_its_dtype_and_times_are_at_least_float32(solver, dtype):
     seen = []
 
@@ -286,3 +290,27 @@ def test_the_listed_times_are_those_of_the_evaluations(solver, path):
     sampler.solve(velocity, noise, generator, Interpolant(path))
     assert sampler.times().tolist() == seen
     assert len(seen) == sampler.nfe
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.bfloat16, torch.float16])
+@pytest.mark.numerics("inversion to noise and back")
+def test_midpoint_steps_invert_what_euler_steps_do_not(dtype):
+    """The velocity is rounded to ``dtype`` as that of a network; the state is at least float32."""
+    generator = torch.Generator().manual_seed(0)
+    means = torch.randn(8, 64, generator=generator, dtype=torch.float64)
+    mixture = GaussianMixture(means, 0.2, torch.ones(8))
+    place = torch.multinomial(torch.ones(8).double(), 64, replacement=True, generator=generator)
+    noise = torch.randn(64, 64, generator=generator, dtype=torch.float64)
+    data = (means[place] + 0.2 * noise).to(torch.promote_types(dtype, torch.float32))
+
+    def velocity(x, time):
+        return mixture.velocity(x, time).to(dtype)
+
+    def round_trip(solver, steps):
+        outward = ode_times(steps, start=0.0, stop=1.0)
+        back = solver(velocity, solver(velocity, data, outward), outward.flip(0))
+        return (back - data).square().mean().sqrt().item()
+
+    assert round_trip(midpoint, 25) < 1e-2  # 50 evaluations each way
+    euler_error = round_trip(euler, 50)
+    assert euler_error > 0.1

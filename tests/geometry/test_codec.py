@@ -22,7 +22,7 @@ RINGS = RingProjection(SENSOR, (2.0, -1.0, -8.5, -20.0))
 
 
 @pytest.mark.parametrize("projection", [SphericalProjection(SENSOR, legacy_seam=True), RINGS])
-def test_to_plain_values_and_back(projection):
+def test_a_geometry_becomes_plain_values_and_comes_back(projection):
     geometry = ScanGeometry(projection, RangeCodec("log2", 6.0), (2, 8))
     stored = json.loads(json.dumps(geometry.to_dict()))
     assert stored == geometry.to_dict()  # nothing that JSON would change, such as a tuple
@@ -31,7 +31,7 @@ def test_to_plain_values_and_back(projection):
     assert hash(restored.projection) == hash(projection)
 
 
-def test_limits_in_radians():
+def test_limits_of_a_sensor_in_radians():
     sensor = LidarSensor(inclination_max_deg=45.0, inclination_min_deg=-90.0)
     assert sensor.inclination_max_rad == pytest.approx(math.pi / 4)
     assert sensor.field_of_view_rad == pytest.approx(0.75 * math.pi)
@@ -52,7 +52,7 @@ def test_impossible_sensors_are_refused():
             LidarSensor(**{name: value})
 
 
-def test_damaged_values_are_refused():
+def test_damaged_values_of_a_geometry_are_refused():
     whole = ScanGeometry(SphericalProjection(SENSOR), RangeCodec(), (2, 8)).to_dict()
     for damaged in (
         {key: whole[key] for key in ("projection", "codec")},

@@ -2,10 +2,13 @@ import math
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from r3dpa.geometry import (
     EMPTY_RANGE_M,
     LidarSensor,
+    RingProjection,
     SphericalProjection,
     in_range,
     points_of,
@@ -26,7 +29,7 @@ def random_points(count, seed=0, farthest=70.0):
     return torch.nn.functional.normalize(direction, dim=-1) * distance
 
 
-def test_axes():
+def test_rows_run_down_and_columns_clockwise():
     """Up is row 0; left of the sensor (+y) is a quarter of the way, right three quarters."""
     points = torch.tensor([[10.0, 0, 9], [10, 0, -9], [-10, 0, 0], [0, 10, 0], [0, -10, 0]])
     row, column = SphericalProjection(SMALL).pixel_of(points)
@@ -64,7 +67,7 @@ def test_range_limits_are_exclusive_and_fov_is_not():
     assert (range_m[0] > 0).sum() == (range_m[-1] > 0).sum() == 1
 
 
-def test_padding_and_batches():
+def test_padded_batches_give_the_images_of_single_scans():
     points, projection = random_points(500), SphericalProjection(SMALL)
     values = torch.rand(500, 2, generator=torch.Generator().manual_seed(2))
     padded_points = torch.full((2, 600, 3), math.nan)
@@ -81,6 +84,7 @@ def test_padding_and_batches():
 
 
 @pytest.mark.parametrize("shape", [(0, 3), (2, 0, 3), (0, 5, 3), (1, 3)], ids=str)
+@pytest.mark.numerics("scans of 0, 1 and 2 points")
 def test_scans_of_no_or_one_point(shape):
     points, projection = torch.full(shape, 5.0), SphericalProjection(SMALL)
     count = points.numel() // 3
@@ -133,7 +137,7 @@ def test_pooling_equals_a_loop():
     assert unfiltered.sum() == len(points) > counts.sum()
 
 
-def test_wrong_shapes_are_refused():
+def test_points_and_images_of_wrong_shapes_are_refused():
     projection, points = SphericalProjection(SMALL), torch.zeros(5, 3)
     for function, arguments, message in (
         (projection.pixel_of, (torch.zeros(7, 4),), r"\(7, 4\)"),
@@ -319,3 +323,65 @@ def test_pooling_does_not_depend_on_threads():
         torch.set_num_threads(before)
     assert torch.equal(results[0], results[1])
     assert torch.equal(results[0], results[2])
+
+
+exhaustive = settings(derandomize=True, max_examples=25, deadline=None)
+
+
+@pytest.mark.numerics("rows of equal pitch and real beams")
+def test_nominal_beams_leave_rows_of_equal_pitch_empty():
+    """HDL-64E: 32 beams of 1/3 degree pitch from +2 down, 32 of 1/2 degree from -8.83 down.
+
+    0.01 degrees are taken off, so that no beam meets the border of a row.
+    """
+    upper, lower = 2 - torch.arange(32) / 3, -8.83 - torch.arange(32) / 2
+    inclinations = torch.cat([upper, lower]).double() - 0.01
+    azimuth = (torch.arange(2083).double() + 0.5) * (2 * math.pi / 2083)
+    up = inclinations.deg2rad()[:, None]
+    xyz = up.cos() * azimuth.cos(), up.cos() * azimuth.sin(), up.sin().expand(64, 2083)
+    points = (20 * torch.stack(xyz, dim=-1)).reshape(-1, 3).float()  # ring after ring, as a file
+
+    sensor = LidarSensor()
+    hit = range_image(points, SphericalProjection(sensor))[0] > 0
+    pitch = 28 / 64
+    expected = {math.floor((3 - angle) / pitch) for angle in inclinations.tolist()}
+    assert set(hit.any(dim=1).nonzero().flatten().tolist()) == expected
+    assert len(expected) == 56
+    assert hit[hit.any(dim=1)].all()  # a row is either full or empty: nothing was dropped
+    by_ring = range_image(points, RingProjection(sensor, tuple(inclinations.tolist())))[0] > 0
+    assert by_ring.all()
+
+    assert hit.any(dim=1).sum() < len(inclinations)  # "each beam has its row"
+    survive = hit.sum() / len(points)
+    assert survive == pytest.approx(0.43, abs=0.005)
+
+
+@st.composite
+def sensors(draw):
+    low = draw(st.floats(-85, 60))
+    return LidarSensor(
+        beams=draw(st.integers(1, 40)),
+        columns=draw(st.integers(1, 200)),
+        inclination_max_deg=low + draw(st.floats(1, 25)),
+        inclination_min_deg=low,
+        range_max_m=draw(st.floats(2, 500)),
+    )
+
+
+@pytest.mark.numerics
+@exhaustive
+@given(sensor=sensors(), seed=st.integers(0, 2**32))
+def test_an_image_comes_back_from_its_points(sensor, seed):
+    """Centres of pixels lie in their pixels, whatever the sensor; ranges to float32 rounding."""
+    generator = torch.Generator().manual_seed(seed)
+    share = torch.rand(sensor.beams, sensor.columns, generator=generator)
+    width = sensor.range_max_m - sensor.range_min_m
+    range_m = sensor.range_min_m + width * (0.001 + 0.998 * share)
+    range_m[torch.rand(range_m.shape, generator=generator) < 0.3] = EMPTY_RANGE_M
+    projection = SphericalProjection(sensor)
+    again, _ = range_image(points_of(range_m, projection), projection)
+    torch.testing.assert_close(again, range_m, rtol=3e-7, atol=0)
+    whole = unproject(range_m.clamp(min=2), projection)
+    row, column = projection.pixel_of(whole)
+    assert torch.equal(row, torch.arange(sensor.beams)[:, None].expand_as(row))
+    assert torch.equal(column, torch.arange(sensor.columns).expand_as(column))

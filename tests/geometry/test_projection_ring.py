@@ -143,7 +143,7 @@ def in_ring_orders(points, ring):
 
 
 @pytest.mark.parametrize("missing", [[], [3]], ids=["whole", "a ring missing"])
-def test_other_orders_are_refused(missing):
+def test_points_in_another_order_are_refused(missing):
     points, ring = scan_of()
     kept = ~torch.isin(ring, torch.tensor(missing))
     for wrong in in_ring_orders(points[kept], ring[kept]).values():

@@ -11,7 +11,7 @@ CODECS = [RangeCodec(), RangeCodec(scale=80.0), RangeCodec("log2"), RangeCodec("
 WIDE = LidarSensor(range_min_m=0.01, range_max_m=1000.0)
 
 
-def test_known_values():
+def test_encoded_ranges_by_hand():
     # 28 m is half of 56 m; 2^2.92 - 1 m is half of the 5.84 octaves above 1 m.
     assert RangeCodec().encode(torch.tensor([0.0, 28.0, 56.0, 90.0])).tolist() == [-1, 0, 1, 1]
     half_m = 2**2.92 - 1 - 1e-4
@@ -19,7 +19,7 @@ def test_known_values():
 
 
 @pytest.mark.parametrize("codec", CODECS, ids=str)
-def test_round_trip(codec):
+def test_encoded_ranges_come_back(codec):
     range_m = torch.linspace(0.02, 55.9, 5000, dtype=torch.float64)
     decoded = codec.decode(codec.encode(range_m), WIDE)
     assert decoded.dtype == torch.float32
@@ -63,7 +63,7 @@ def test_half_precision_images_decode_in_float32_with_a_gradient():
     assert image.grad.tolist() == [28.0]
 
 
-def test_wrong_settings_are_refused():
+def test_unknown_encodings_and_scales_are_refused():
     with pytest.raises(ValueError, match="'log10'"):
         RangeCodec("log10")
     with pytest.raises(ValueError, match="-1"):

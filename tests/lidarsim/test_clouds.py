@@ -287,15 +287,3 @@ def test_a_missing_package_is_named(tmp_path, monkeypatch):
     path.write_bytes(pcd("binary", TABLE.tobytes()))
     with pytest.raises(ScanError, match=r"a\.pcd: \.pcd needs pypcd4: pip install 'r3dpa\[pcd\]'"):
         read_cloud(path)
-
-
-def test_a_folder_without_scans_is_named(tmp_path):
-    with pytest.raises(ScanError, match=r"is an empty folder; can be read: \.bin"):
-        find_files(tmp_path)
-    (tmp_path / "a.txt").touch()
-    with pytest.raises(
-        ScanError, match=r"it holds 1 other files, such as a\.txt; can be read: \.b"
-    ):
-        find_files(tmp_path)
-    with pytest.raises(ScanError, match="nowhere: is no folder and no file"):
-        find_files(tmp_path / "nowhere")

@@ -74,7 +74,7 @@ def test_further_columns_and_precision_stay(points, tmp_path):
         assert again.columns["return_type"].dtype == np.uint8
 
 
-def test_what_cannot_be_written_is_refused_before_anything_is(folder, points, tmp_path):
+def test_targets_that_cannot_be_written_are_refused_before_anything_is(folder, points, tmp_path):
     out = tmp_path / "out"
     with pytest.raises(ValueError, match=r"unknown format ''; choose --to from bin, pcd\.bin, ply"):
         convert(folder, out)

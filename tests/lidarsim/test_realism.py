@@ -108,7 +108,7 @@ def test_distance_and_floor_are_medians_over_pairs_of_drives(drives):
     assert row.pooled == 0
 
 
-def test_what_scans_cannot_give_is_named(drives):
+def test_measures_that_scans_cannot_give_are_named(drives):
     points = street(30)
     points[:, 3] = 0
     shuffled = np.random.default_rng(0).permutation(points)

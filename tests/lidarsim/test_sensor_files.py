@@ -2,6 +2,7 @@
 
 import dataclasses
 import hashlib
+from importlib.resources import files
 
 import numpy as np
 import pytest
@@ -9,7 +10,6 @@ import yaml
 
 from lidarsim import LidarSensor, Simulator, load_sensor
 from lidarsim.sensors import PRESETS, SensorFile, read_sensor, write_sensor
-from lidarsim.sensors.files import _FOLDER
 
 # Of the laser tables as they were computed before they became files.
 DIGESTS = {"hdl64e": "736df866f3493580", "hdl32e": "c0134b0844499427", "vls128": "447e61c6918173c5"}
@@ -35,7 +35,8 @@ def test_presets_name_their_source_and_can_be_simulated(name):
 
 def test_files_of_other_licences_keep_their_notice():
     for name, holder in (("pandar64", "NVIDIA"), ("waymo_top", "NVIDIA"), ("os1_128", "Ouster")):
-        first = (_FOLDER / f"{name}.yaml").read_text().splitlines()[0]
+        file = files("lidarsim.sensors") / "presets" / f"{name}.yaml"
+        first = file.read_text().splitlines()[0]
         assert first.startswith("# Copyright (c)")
         assert holder in first
 

@@ -38,7 +38,7 @@ def rings_of(points):
     return np.append(0, np.cumsum(np.diff(azimuth) < 0))
 
 
-def test_types_and_ranges(street_scan):
+def test_points_labels_and_origins_have_their_types_and_ranges(street_scan):
     points, labels, origins = street_scan.points, street_scan.labels, street_scan.origins
     assert rings_of(points).max() == 63
     assert (points.dtype, labels.dtype, origins.dtype) == (np.float32, np.uint32, np.uint8)
@@ -85,7 +85,7 @@ def test_moving_sensor_stores_points_as_if_it_stood():
     assert len(points) != len(still) or np.abs(points - still[:, :3]).max() > 0.1
 
 
-def test_switches():
+def test_an_effect_can_be_switched_off_and_on():
     scene = Scene((WALL,), weather=Conditions(visibility_m=40))
     clear = simulate_scan(replace(scene, weather=DRY), hdl64e(90), (0,))
     off = simulate_scan(scene, hdl64e(90), (0,), {"fog": "off"})
@@ -151,3 +151,8 @@ def test_a_simulator_gives_the_scans_of_its_drive():
     assert scan.scene == scene
     assert Simulator(sensor="vls128").sensor.num_beams == 128
     assert doctest.testmod(module).failed == 0
+
+
+def test_weather_of_another_kind_is_refused():
+    with pytest.raises(ValueError, match=r"an object such as Weather\(rain_mm_h=3\), got a dict"):
+        Simulator(weather={"rain_mm_h": 3})

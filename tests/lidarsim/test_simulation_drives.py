@@ -36,7 +36,7 @@ def stems(root, kind="data"):
     return sorted(p.stem for p in root.rglob(f"{kind}/*") if not p.name.startswith("."))
 
 
-def test_layout_and_contents(tmp_path):
+def test_a_simulated_data_set_has_the_layout_of_kitti360(tmp_path):
     assert expected_scans(tmp_path) is None
     report = simulate(tmp_path, 5, seed=3, drives=["0000", "0004"], **SMALL)
     assert (report.scans_per_drive, report.num_written) == ({"0004": 4, "0000": 1}, 5)
@@ -302,7 +302,7 @@ def test_a_damaged_manifest_is_named(tmp_path, text):
 
 
 @pytest.mark.parametrize("scans", [1, 2, 3, 10, 100, 1001])
-def test_split(scans):
+def test_scans_are_split_over_training_and_validation_drives(scans):
     counts = split_scans(scans, (*TRAIN_DRIVES, *VAL_DRIVES))
     train, val = ([counts.get(d, 0) for d in group] for group in (TRAIN_DRIVES, VAL_DRIVES))
     assert sum(val) == (max(1, round(0.2 * scans)) if scans >= 2 else 0)
@@ -370,3 +370,11 @@ def test_report_by_hand():
     assert idle.num_written == 0
     empty = drives.make_report([summaries[0] | {"points": 0}], 0)
     assert "1 of them hold no points" in str(empty)
+
+
+@pytest.mark.fuzz
+@pytest.mark.parametrize("drive", ["../../x", "/etc", "0003/../..", ""])
+def test_drives_of_a_manifest_that_leave_the_folder_are_refused(drive, tmp_path):
+    (tmp_path / "simulation.json").write_text(json.dumps({"scans": 3, "drives": [drive]}))
+    with pytest.raises(ValueError, match=r"simulation\.json does not say"):
+        expected_scans(tmp_path)

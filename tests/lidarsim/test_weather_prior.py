@@ -60,6 +60,7 @@ class TestPrior:
             ({"probability": 1.5}, r"probability must lie in \[0, 1\], got 1.5"),
             ({"probability": -0.1}, r"probability must lie in \[0, 1\], got -0.1"),
             ({"rain_mm_h": (5, 1)}, "rain_mm_h must be a positive interval, got 5..1"),
+            ({"rain_mm_h": (0, 1)}, "rain_mm_h must be a positive interval, got 0..1"),
             ({"visibility_m": (0.5, 10)}, "visibility_m must be 1 or greater"),
             ({"rain_mm_h": (1, 1000)}, "rain_mm_h must be at most 500"),
         ],

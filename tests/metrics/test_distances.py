@@ -23,7 +23,12 @@ from r3dpa.metrics.feature_distances import (
     PolynomialMMD,
     PrecisionRecall,
 )
-from r3dpa.metrics.functional import fd_infinity, frechet_distance_of, polynomial_mmd, shared_balls
+from r3dpa.metrics.functional import (
+    fd_infinity,
+    frechet_distance_of,
+    polynomial_mmd,
+    shared_balls,
+)
 from r3dpa.metrics.functional_bev import (
     BEVGrid,
     chamfer_squared,
@@ -127,6 +132,7 @@ def updated(metric, name, part=slice(None), sides=(True, False)):
 
 
 @pytest.mark.parametrize("name", NAMES)
+@pytest.mark.numerics("sliced Wasserstein of unequal sizes")
 def test_batches_give_what_the_function_gives(name):
     metric = updated(updated(metric_of(name), name, slice(3)), name, slice(3, None))
     assert metric.compute() == pytest.approx(expected(name), rel=1e-6)
@@ -237,6 +243,7 @@ def test_drawn_subsets_depend_on_names_alone(name):
         (torch.full((2, 3), 60.0), "real cloud 1: none of 2 points"),
     ],
 )
+@pytest.mark.numerics("empty cloud in a matching")
 def test_a_refused_cloud_leaves_the_state(cloud, message):
     metric = metric_of("bev")
     with pytest.raises(ValueError, match=message):
@@ -256,7 +263,8 @@ def test_refused_features_leave_the_state():
 
 
 @pytest.mark.parametrize(("num_real", "message"), [(20, "generated: 6 samples"), (3, "real: 3 ")])
-def test_few_samples(num_real, message):
+@pytest.mark.numerics("Frechet distance of few samples")
+def test_too_few_samples_for_the_features_are_refused_or_noted(num_real, message):
     metric = FrechetDistance(6, "X")
     metric.update(draw(num_real, 6), real=True)
     metric.update(draw(6, 6, seed=1), real=False)
@@ -264,17 +272,6 @@ def test_few_samples(num_real, message):
         metric.compute()
     row = metric.results(Resampling(num_resamples=0))[0]
     assert "scenes for 6 features: dominated by their small number" in row.note
-
-
-def test_histograms_have_no_empty_copy_for_reset():
-    """torchmetrics keeps the empty states: 16 groups of the published grid take 256 MB."""
-    metric = metric_of("bev", num_groups=5)
-    for name in ("real_bins", "generated_bins"):
-        assert metric._defaults[name].numel() == 1
-    updated(metric, "bev").reset()
-    assert metric.generated_bins.shape == (5, *metric.real_bins.shape)
-    assert not metric.generated_bins.any()
-    assert metric.generated_bins.is_contiguous()
 
 
 def run_process(rank, folder):
@@ -348,7 +345,7 @@ def test_updates_stay_on_the_device(monkeypatch, name):
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 @pytest.mark.parametrize("name", NAMES)
-def test_on_a_gpu(name):
+def test_distances_on_a_gpu_are_those_of_a_cpu(name):
     metric = metric_of(name).cuda()
     for real in (True, False):
         samples = data(name, real)

@@ -1,4 +1,4 @@
-"""Distances of feature sets and clouds, by hand and against plain loops."""
+"""Distances of feature sets, by hand and against plain loops."""
 
 import math
 from itertools import product
@@ -6,26 +6,26 @@ from itertools import product
 import numpy as np
 import pytest
 import torch
+from draws import drawn
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.linalg import sqrtm
 
-from r3dpa.metrics import functional_bev
 from r3dpa.metrics.functional import (
     Moments,
     fd_infinity,
     frechet_distance,
     frechet_distance_of,
     frechet_of_draws,
+    merge_packed,
     polynomial_mmd,
     shared_balls,
     squared_mmd,
     squared_mmd_error,
 )
-from r3dpa.metrics.functional_bev import (
-    BEVGrid,
-    chamfer_squared,
-    histogram_distance,
-    minimum_matching,
-)
+
+FEW = settings(derandomize=True, max_examples=15, deadline=None, database=None)
+DTYPES = [torch.float32, torch.bfloat16, torch.float16]
 
 
 def draw(*shape, seed=0):
@@ -80,6 +80,8 @@ def test_fd_infinity_of_a_shift():
     assert result[0] == pytest.approx(5 * 2**2, abs=1.0)
     assert 0 < result[1] < 1
     assert fd_infinity(draw(400, 5), draw(400, 5, seed=1) + 2, generator.manual_seed(0)) == result
+    with pytest.raises(ValueError, match="at least 68 are needed; polynomial_mmd has no bias"):
+        fd_infinity(draw(16, 16), draw(16, 16, seed=1), generator)
 
 
 def test_mmd_by_hand():
@@ -173,115 +175,6 @@ def test_prdc_with_a_real_outlier_against_plain_distances(far, tolerance):
     assert precision_recall(real, generated) == pytest.approx(expected, abs=tolerance)
 
 
-@pytest.mark.parametrize("function", [squared_mmd, precision_recall])
-def test_values_whose_powers_overflow_are_refused(function):
-    x = draw(30, 3)
-    x[4] = 1e60
-    with pytest.raises(ValueError, match=r"1 of 30 rows .* beyond 1e\+50, the first is row 4"):
-        function(x, x)
-
-
-# Bird's-eye view
-
-GRID = BEVGrid(4.0, 1.0)
-
-
-def cloud(*xy):
-    return torch.tensor([[x, y, 0.0] for x, y in xy])
-
-
-def test_cells_of_a_grid():
-    """Index 0 is the lower limit, borders belong to the upper cell, limits are outside."""
-    points = cloud((-3.9, -3.9), (0.0, 0.5), (0.9, 0.0), (3.9, -1e-6), (4.0, 0.0), (-4.0, 0.0))
-    assert GRID.cells(points).tolist() == [0, 4 * 8 + 4, 7 * 8 + 3]
-    assert len(GRID.points_inside(points)) == 4
-    assert GRID.side == 8
-    assert BEVGrid(4.0, 0.7).cells(cloud((-3.9, -3.9), (3.9, 3.9))).tolist() == [0, 10 * 12 + 10]
-
-
-def test_every_point_of_the_published_grid_has_a_cell():
-    """The largest float32 below 50 m falls in the last cell and not beyond."""
-    edge = torch.nextafter(torch.tensor(50.0), torch.tensor(0.0)).item()
-    cells = BEVGrid().cells(cloud((edge, edge), (-edge, -edge)))
-    assert cells.tolist() == [0, 2000 * 2000 - 1]
-
-
-def test_histogram_distances_by_hand():
-    """Shares (1, 0) and (1/2, 1/2): m = (3/4, 1/4), (ln 4/3 + ln 2/3 / 2 + ln 2 / 2) / 2."""
-    result = histogram_distance(torch.tensor([2, 0, 0]), torch.tensor([3, 3, 0]))
-    expected = (math.log(4 / 3) + math.log(2 / 3) / 2 + math.log(2) / 2) / 2
-    assert result.jsd_divergence == pytest.approx(expected, rel=1e-14)
-    assert result.jsd_distance == pytest.approx(math.sqrt(expected), rel=1e-14)
-    assert (result.l1, result.total_variation) == (1, 0.5)
-    apart = histogram_distance(torch.tensor([1, 0]), torch.tensor([0, 5]))
-    assert apart.jsd_distance == pytest.approx(math.sqrt(math.log(2)))
-    assert (apart.l1, apart.total_variation) == (2, 1)
-    same = histogram_distance(torch.tensor([1, 2]), torch.tensor([2, 4]))
-    assert set(same) == {0}
-    with pytest.raises(ValueError, match="second histogram is empty"):
-        histogram_distance(torch.ones(2), torch.zeros(2))
-
-
-def test_chamfer_by_hand():
-    """(0 + 4) / 2 one way, 0 the other: half of 2; a fourth column does not count."""
-    a = torch.tensor([[0.0, 0, 0, 7], [0, 0, 2, 9]])
-    assert chamfer_squared(a, torch.zeros(1, 3)) == 1
-    assert chamfer_squared(torch.zeros(1, 3), a) == 1
-    with pytest.raises(ValueError, match="points_b has no point"):
-        chamfer_squared(a, torch.zeros(0, 3))
-
-
-def chamfer_cells(cells_a, cells_b, grid):
-    """Chamfer distance of :func:`minimum_matching` for one pair, all cells against all."""
-    side = grid.side
-    a, b = (torch.stack([c // side, c % side], dim=1).double() for c in (cells_a, cells_b))
-    squared = torch.cdist(a, b).square().round()
-    return (squared.amin(1).mean() + squared.amin(0).mean()).item() / (2 * side**2)
-
-
-def test_matching_by_hand():
-    """On 8 x 8 cells: 3 and 4 cells apart are 25 / 64; the nearer sample is 1 / 64 away."""
-    reference = GRID.cells(cloud((0.5, 0.5)))
-    far, near = GRID.cells(cloud((3.5, -3.5))), GRID.cells(cloud((0.5, 1.5)))
-    assert chamfer_cells(reference, far, GRID) == 25 / 64
-    result = minimum_matching([reference], [far, near], GRID)
-    assert result.squared_normalised.tolist() == [1 / 64]
-    assert result.nearest.tolist() == [1]
-
-
-def random_cells(grid, num_clouds, seed):
-    generator = torch.Generator().manual_seed(seed)
-    for _ in range(num_clouds):
-        centre = torch.rand(1, 3, generator=generator) - 0.5
-        points = centre + 0.2 * torch.randn(150, 3, generator=generator)
-        yield grid.cells((2 * grid.half_m * points)[points.abs().amax(dim=1) < 0.5])
-
-
-@pytest.mark.parametrize("threads", [1, 2])
-def test_matching_equals_all_against_all(threads, monkeypatch):
-    """Though most pairs are never measured: their lower bounds exceed the best distance."""
-    measured, measure = [], functional_bev._mean_squared
-
-    def counted(tree, places):
-        measured.append(None)
-        return measure(tree, places)
-
-    monkeypatch.setattr(functional_bev, "_mean_squared", counted)
-    grid = BEVGrid(cell_m=1.0)
-    references, samples = list(random_cells(grid, 12, 0)), list(random_cells(grid, 15, 1))
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads)
-    try:
-        result = minimum_matching(references, samples, grid)
-    finally:
-        torch.set_num_threads(before)
-    pairs = torch.tensor([[chamfer_cells(x, y, grid) for y in samples] for x in references])
-    best = pairs.double().min(dim=1)
-    torch.testing.assert_close(result.squared_normalised, best.values, rtol=1e-6, atol=0)
-    assert torch.equal(result.nearest, best.indices)
-    assert len(measured) < 0.5 * len(references) * len(samples)
-
-
 @pytest.mark.parametrize(
     "compare",
     [
@@ -297,3 +190,145 @@ def test_features_of_other_widths_do_not_compare(compare):
     for first, second in ((3, 1), (1, 3), (2, 3)):
         with pytest.raises(ValueError, match=rf"{first}.* {second}\b"):
             compare(draw(60, first), draw(60, second, seed=1))
+
+
+FINITE = st.floats(-100, 100, width=32)
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.numerics("root of a singular covariance product")
+def test_the_distance_of_few_samples_is_real_and_not_negative(dtype):
+    """20 samples of 64 features: rank 19. Eigenvalues of the product itself are not real."""
+    a, b = drawn(0, 20, 64).to(dtype), (2 * drawn(1, 20, 64) + 1).to(dtype)
+    x, y = Moments.of(a), Moments.of(b)
+    distance = frechet_distance_of(a, b)
+    assert math.isfinite(distance)
+    assert distance == pytest.approx(frechet_distance_of(b, a), rel=1e-12)
+    assert 0 <= frechet_distance_of(a, a) < 1e-8
+    as_if_symmetric = torch.linalg.eigvalsh((x.covariance() @ y.covariance()).float())
+    assert as_if_symmetric.min() < -1e-3
+    assert as_if_symmetric.sqrt().sum().isnan()
+
+
+@pytest.mark.numerics("root of a singular covariance product")
+def test_flat_and_empty_covariances():
+    """By hand: |u|^2 + |v|^2 - 2 |u v| of two lines, the trace against a point, 0 of two points."""
+
+    @FEW
+    @given(u=st.lists(FINITE, min_size=5, max_size=5), v=st.lists(FINITE, min_size=5, max_size=5))
+    def check(u, v):
+        u, v, zero = torch.tensor(u).double(), torch.tensor(v).double(), torch.zeros(5).double()
+        lines = torch.outer(u, u), torch.outer(v, v)
+        size = float(u @ u + v @ v)
+        expected = size - 2 * abs(float(u @ v))
+        # A rank-one matrix has four eigenvalues of rounding errors only.
+        found = frechet_distance(zero, lines[0], zero, lines[1]).item()
+        assert found == pytest.approx(expected, abs=1e-6 * size + 1e-12)
+        nothing = torch.zeros(5, 5)
+        assert frechet_distance(zero, lines[0], zero, nothing).item() == pytest.approx(float(u @ u))
+        assert frechet_distance(zero, nothing, zero, nothing) == 0
+
+    check()
+    line = torch.outer(*2 * [torch.arange(1.0, 6.0)])
+    assert torch.linalg.eigvalsh(line).sqrt().isnan().any()
+
+
+@pytest.mark.numerics("Frechet distance of few samples")
+def test_extrapolation_and_kernel_tell_equal_distributions():
+    """Both sets are of one distribution of 20 features, 400 samples each."""
+    biased, limits, kernels = [], [], []
+    for seed in range(0, 20, 2):
+        a, b = drawn(seed, 400, 20), drawn(seed + 1, 400, 20)
+        biased.append(frechet_distance_of(a, b))
+        limits.append(fd_infinity(a, b, generator(seed))[0])
+        kernels.append(squared_mmd(a, b).item())
+    for values in (np.array(limits), np.array(kernels)):
+        assert abs(values.mean()) < 2 * values.std(ddof=1) / math.sqrt(len(values))
+    assert min(biased) > 0.3
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.numerics("accumulation of moments")
+def test_any_partition_gives_the_moments_of_the_whole(dtype):
+    """Mean 5, deviations down to 0.02, as of normalised features; parts of any sizes."""
+    worst = []
+
+    @FEW
+    @given(
+        sizes=st.lists(st.integers(1, 40), min_size=2, max_size=8),
+        deviation=st.floats(0.02, 1.0),
+        seed=st.integers(0, 100),
+    )
+    def check(sizes, deviation, seed):
+        features = (5 + deviation * drawn(seed, sum(sizes), 3)).to(dtype)
+        parts = [Moments.of(part).pack() for part in features.split(sizes)]
+        merged, whole = Moments.unpack(merge_packed(torch.stack(parts))), Moments.of(features)
+        assert merged.count == sum(sizes)
+        torch.testing.assert_close(merged.mean, whole.mean, rtol=1e-13, atol=0)
+        torch.testing.assert_close(merged.scatter, whole.scatter, rtol=1e-10, atol=1e-12)
+        exact = np.cov(features.double().numpy().T)
+        np.testing.assert_allclose(whole.covariance(), exact, rtol=1e-9, atol=1e-13)
+        # As a streaming metric in the dtype of the features adds them up.
+        total, products = torch.zeros(3, dtype=dtype), torch.zeros(3, 3, dtype=dtype)
+        for one in features:
+            total += one
+            products += torch.outer(one, one)
+        mean = total / len(features)
+        off = products / len(features) - torch.outer(mean, mean)
+        worst.append(np.abs(off.double().numpy() - exact).max() / exact.max())
+
+    check()
+    assert max(worst) > 0.01
+
+
+@pytest.mark.numerics("accumulation of moments")
+def test_a_shift_leaves_the_covariance():
+    x = drawn(0, 500, 4).double()
+    moments = Moments.of(x + 1e4)
+    torch.testing.assert_close(moments.covariance(), x.T.cov(), rtol=1e-9, atol=1e-10)
+    products = (x + 1e4).T @ (x + 1e4) - 500 * torch.outer(moments.mean, moments.mean)
+    assert (products / 499 - x.T.cov()).abs().max() > 1e-9  # in float64
+
+
+@pytest.mark.parametrize(
+    ("value", "dtype"),
+    [*product([torch.nan, torch.inf, -torch.inf], DTYPES), (1e60, torch.float64)],
+)
+@pytest.mark.numerics("constant and NaN features")
+def test_a_broken_feature_is_named_by_its_row(value, dtype):
+    good = drawn(0, 30, 4).to(dtype)
+    broken = good.clone()
+    broken[17, 2] = value
+    message = r"1 of 30 rows hold NaN or values beyond 1e\+50, the first is row 17; check the scan"
+    for compare in (
+        frechet_distance_of,
+        squared_mmd,
+        shared_balls,
+        lambda a, b: fd_infinity(a, b, generator()),
+        lambda a, b: polynomial_mmd(a, b, generator(), 2, 10),
+    ):
+        with pytest.raises(ValueError, match=f"generated features: {message}"):
+            compare(good, broken)
+        with pytest.raises(ValueError, match=f"real features: {message}"):
+            compare(broken, good)
+    assert not broken.double().mean(0)[2].square().square().square().isfinite()
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.numerics("constant and NaN features")
+def test_constant_features_have_finite_distances(dtype):
+    """A collapsed extractor: covariance 0, all distances between samples 0."""
+    same, other = torch.full((30, 4), 0.7, dtype=dtype), torch.full((30, 4), 2.5, dtype=dtype)
+    gap = (other - same).double().square().sum(1)[0].item()
+    assert frechet_distance_of(same, same) == pytest.approx(0, abs=1e-12)
+    assert frechet_distance_of(same, other) == pytest.approx(gap, rel=1e-2)
+    assert squared_mmd(same, same).item() == pytest.approx(0, abs=1e-12)
+    assert fd_infinity(same, other, generator())[0] == pytest.approx(gap, rel=1e-2)
+    for made in (same, other):
+        assert all(share.isfinite().all() for share in shared_balls(same, made).values())
+    standardised = (same - same.mean(0)) / same.std(0)
+    assert not standardised.isfinite().all()

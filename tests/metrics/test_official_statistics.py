@@ -149,7 +149,7 @@ class TestLoad:
             OfficialStatistics.load(write(tmp_path / "new.npy")).cells,
         )
 
-    def test_runs_no_code(self, tmp_path):
+    def test_a_pickle_runs_no_code(self, tmp_path):
         class Harm:
             def __reduce__(self):
                 return os.mkdir, (str(tmp_path / "harm"),)
@@ -180,12 +180,12 @@ class TestLoad:
             ),
         ],
     )
-    def test_errors_name_the_file(self, tmp_path, value, message):
+    def test_damaged_statistics_are_named_with_their_file(self, tmp_path, value, message):
         with pytest.raises(ValueError, match=message) as caught:
             OfficialStatistics.load(write(tmp_path / "named.npy", value))
         assert "named.npy" in str(caught.value)
 
-    def test_other_files(self, tmp_path, file):
+    def test_files_that_are_no_official_statistics_are_refused(self, tmp_path, file):
         np.save(tmp_path / "plain.npy", np.zeros(3))
         for name in ("plain.npy", "missing.npy"):
             with pytest.raises(ValueError, match=f"{name}: is no official statistics file"):
@@ -210,3 +210,24 @@ class TestCommand:
         assert "left_out" in printed
         assert (out / "table.tex").exists()
         assert not (out / "birds_eye.png").exists()
+
+
+@pytest.mark.fuzz
+@pytest.mark.parametrize(
+    ("pickled", "reason"),
+    [
+        (b"\x80\x04}r\xff\xff\xff\x7f.", "no attribute 'item'"),
+        (b"\x80\x05\x8e" + (2**40).to_bytes(8, "little") + b"abc.", "EOFError"),
+        (b"cnumpy\nndarray\n(I1099511627776\ntR.", "not callable"),
+        (
+            pickle.dumps(np.array([None] * 77), 3).replace(b"KM\x85", b"J\xff\xff\xff\x7f\x85"),
+            r"array of shape \(2147483647,\) is cut short",
+        ),
+    ],
+)
+def test_pickles_that_claim_much_memory_are_refused(pickled, reason, tmp_path):
+    path = tmp_path / "statistics.npy"
+    np.save(path, np.array(None), allow_pickle=True)
+    path.write_bytes(path.read_bytes()[:128] + pickled)
+    with pytest.raises(ValueError, match=rf"statistics\.npy: is no official .*{reason}"):
+        OfficialStatistics.load(path)

@@ -1,3 +1,4 @@
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,7 @@ from safetensors.torch import save_file
 from r3dpa.geometry import LidarSensor
 from r3dpa.metrics.collection import metrics_by_name
 from r3dpa.metrics.reference import ReferenceStatistics, cards_of, compute_reference, split_halves
-from r3dpa.metrics.scene import DEFAULT, EvaluationScene, through_sensor
+from r3dpa.metrics.scene import DEFAULT, PROTOCOLS, EvaluationScene, through_sensor
 from r3dpa.metrics.scene_features import SceneFeatures
 
 SENSOR = LidarSensor(beams=16, columns=64)
@@ -188,7 +189,7 @@ def test_scans_must_come_as_announced():
         ReferenceStatistics(PROTOCOL, {}, ["a/0"], {})
 
 
-def test_other_features_are_refused():
+def test_features_unlike_those_of_the_reference_are_refused():
     with pytest.raises(ValueError, match="holds 0 of 11 scans"):
         empty().check([TOY])
     stored = filled()
@@ -229,4 +230,18 @@ def test_tensors_of_other_shapes_are_named(tmp_path, key, change, message):
         tensors[key] = change(found).contiguous()
     save_file(tensors, path, metadata=card)
     with pytest.raises(ValueError, match=rf"a\.safetensors holds .*{message}"):
+        ReferenceStatistics.load(path)
+
+
+@pytest.mark.fuzz
+def test_scan_names_that_leave_the_folder_are_refused(tmp_path):
+    path = tmp_path / "a.safetensors"
+    protocol = replace(PROTOCOLS["default"], sensor=LidarSensor(4, 16))
+    ReferenceStatistics(protocol, {}, ["a/0", "b/0"], {}).save(path)
+    with safe_open(path, framework="pt") as file:
+        tensors, about = {key: file.get_tensor(key) for key in file.keys()}, file.metadata()  # noqa: SIM118
+    card = json.loads(about["r3dpa_reference"])
+    card["names"][0] = "../../x"
+    save_file(tensors, path, {"r3dpa_reference": json.dumps(card)})
+    with pytest.raises(ValueError, match=r"a\.safetensors holds no .*name of a scan"):
         ReferenceStatistics.load(path)

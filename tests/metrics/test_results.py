@@ -115,6 +115,7 @@ def test_a_number_that_is_none_is_refused(fields):
         MetricResult("FRID", **fields)
 
 
+@pytest.mark.numerics("floor of the Jensen-Shannon distance")
 def test_a_difference_below_the_larger_floor_or_the_half_widths_is_a_tie():
     # half widths 3 and 4, in squares: values tie up to a difference of 5
     a = MetricResult("M", 20.0, interval=(17.0, 23.0))
@@ -225,7 +226,7 @@ def table():
     )
 
 
-def test_text(table):
+def test_a_table_as_text(table):
     lines = [re.sub(" +", " ", line) for line in str(table).splitlines()]
     assert re.fullmatch(r"\|:-+\|-+:\|-+:\|", lines.pop(1))
     assert lines == [
@@ -245,7 +246,7 @@ def test_text(table):
     ]
 
 
-def test_latex(table):
+def test_a_table_as_latex(table):
     lines = [line for line in table.latex().splitlines() if not line.startswith("%")]
     assert [re.sub(" +", " ", line).strip() for line in lines] == [
         r"\begin{tabular}{lrr}",

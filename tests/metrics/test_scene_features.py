@@ -10,7 +10,7 @@ from r3dpa.metrics.networks.liploc import LIPLoc
 from r3dpa.metrics.networks.minkowski import SPVCNN, MinkowskiNet, official_name
 from r3dpa.metrics.networks.pointnet import PointNet
 from r3dpa.metrics.networks.rangenet import RangeNet, picked
-from r3dpa.metrics.networks.rangevit import _NAMES, RangeViT, range_channels
+from r3dpa.metrics.networks.rangevit import RangeViT, range_channels
 from r3dpa.metrics.networks.sparse import pool_voxels, voxelize
 from r3dpa.metrics.scene import DEFAULT, PUBLISHED, EvaluationScene, through_sensor
 from r3dpa.metrics.scene_features import (
@@ -24,6 +24,16 @@ from r3dpa.metrics.scene_features import (
 SENSOR = LidarSensor(beams=16, columns=64)
 CENTRE, CORNER = (replace(protocol, sensor=SENSOR) for protocol in (DEFAULT, PUBLISHED))
 WIDTHS = (4, 4, 4, 4, 4, 4, 4, 4, 3)
+RANGEVIT = {  # beginnings of our names and of the official ones
+    "image_": "image_",
+    "stem.": "rangevit.encoder.patch_embed.conv_block.",
+    "embedding.": "rangevit.encoder.patch_embed.proj_block.1.",
+    "encoder.": "rangevit.encoder.",
+    "norm.": "rangevit.encoder.norm.",
+    "upsample.": "rangevit.decoder.up_conv_block.conv_upsample.0.",
+    "merge.": "rangevit.decoder.up_conv_block.conv1.",
+    "output.": "rangevit.decoder.up_conv_block.conv_output.",
+}
 # Batches of other sizes are added up in another order; features are of size 1.
 FLOAT32 = {"atol": 1e-5, "rtol": 1e-5}
 
@@ -207,8 +217,8 @@ def test_official_files_become_spaces(tmp_path):
     network = RangeViT(SENSOR, 4, 64, 1, 1, 4, 6, 5)
     state = {}
     for key, value in network.state_dict().items():
-        ours = next(name for name in _NAMES if key.startswith(name))
-        state[_NAMES[ours] + key.removeprefix(ours)] = value
+        ours = next(name for name in RANGEVIT if key.startswith(name))
+        state[RANGEVIT[ours] + key.removeprefix(ours)] = value
     torch.save({"state_dict": state}, tmp_path / "frid.ckpt")
     space = scene_features("frid", tmp_path / "frid.ckpt", CENTRE)
     assert torch.equal(space(seen(1)), range_vit_space(network)(seen(1)))

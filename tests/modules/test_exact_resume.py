@@ -8,8 +8,7 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-from test_stages import QUICK, STAGES, assert_equal_runs
-from test_stages import from_previous as from_previous  # a fixture
+from stage_runs import QUICK, STAGES, assert_equal_runs
 
 from r3dpa.data import kitti360_scans
 

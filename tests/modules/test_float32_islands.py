@@ -57,7 +57,7 @@ def dtypes():
 
 @pytest.mark.numerics
 class TestIslands:
-    def test_layers(self, dtypes):
+    def test_dtypes_of_layers(self, dtypes):
         """These and no others: a longer list would be slow, a shorter one imprecise."""
         found, _ = dtypes
         layers = {name: dtype for name, dtype in found.items() if "." in name}
@@ -65,10 +65,10 @@ class TestIslands:
         assert {n for n, dtype in layers.items() if dtype == torch.float32} == LAYERS
 
     @pytest.mark.parametrize("name", [name for _, name in FUNCTIONS])
-    def test_functions(self, dtypes, name):
+    def test_dtypes_of_functions(self, dtypes, name):
         assert dtypes[0][name] == torch.float32
 
-    def test_state(self, dtypes):
+    def test_dtypes_of_the_state(self, dtypes):
         """Weights, statistics, averages, gradients and moments."""
         _, module = dtypes
         weights, moments = module.states[-1]

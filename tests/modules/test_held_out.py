@@ -6,6 +6,7 @@ import json
 import os
 import socket
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import lightning as L
 import pytest
@@ -120,6 +121,7 @@ def evaluate(rank, num_processes, port, counts, folder):
     ],
 )
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded, use of fork")
+@pytest.mark.numerics("uneven last batch")
 def test_losses_do_not_depend_on_the_number_of_processes(
     num_processes, counts, tmp_path, one_thread
 ):
@@ -145,3 +147,14 @@ def test_draws_for_held_out_scans_are_not_those_of_training():
     for name, values in held_out._asdict().items():
         assert values.shape == getattr(training, name).shape
         assert not torch.equal(values, getattr(training, name)), name
+
+
+@pytest.mark.parametrize("run", ["validate", "test"])
+@pytest.mark.numerics("batch norm on real and fake batches")
+def test_held_out_scans_are_not_shown_to_the_discriminator(run, tmp_path):
+    """Its running statistics mix scans with reconstructions, and describe neither."""
+    module, data = stage_module("joint"), HeldOut(4)
+    module.discriminator.forward = Mock(side_effect=AssertionError("the discriminator was called"))
+    data.test_dataloader = data.val_dataloader
+    trainer = L.Trainer(default_root_dir=tmp_path, **SILENT)
+    assert getattr(trainer, run)(module, datamodule=data, verbose=False)

@@ -5,21 +5,14 @@ import numpy as np
 import pytest
 import torch
 from lightning import Trainer
+from point_clouds import GRID, cloud
 from tiny_stages import SILENT
 
 from r3dpa.data import LidarDataModule, write_bin
 from r3dpa.data.datamodules import PointDataModule
 from r3dpa.data.datasets import DrawnPoints
-from r3dpa.features import Masking, ScanGrid, WaffleIron, WaffleIronS, collate_scans
+from r3dpa.features import Masking, WaffleIron, WaffleIronS, collate_scans
 from r3dpa.modules import PointPretraining
-
-GRID = ScanGrid((-8.0, -8.0, -2.0), (8.0, 8.0, 4.0), cell_m=0.5, voxel_m=0.3, num_neighbors=4)
-
-
-def cloud(seed=0, num_points=800):
-    generator = torch.Generator().manual_seed(seed)
-    xyz = torch.randn(num_points, 3, generator=generator) * torch.tensor([4.0, 4.0, 1.0])
-    return torch.cat([xyz, torch.rand(num_points, 1, generator=generator)], dim=1)
 
 
 @pytest.fixture
@@ -60,7 +53,7 @@ def test_nothing_is_learnt_from_hidden_points(module, masked):
     assert (changed - tokens)[hidden].abs().max() > 1e-4  # hidden points do read from the others
 
 
-def test_without_hidden_points_it_is_the_network(module, masked):
+def test_tokens_without_hidden_points_are_those_of_the_network(module, masked):
     module.eval()
     batch = collate_scans([each.scan for each in masked])
     nothing = torch.zeros(len(batch.features), dtype=torch.bool)
@@ -140,7 +133,7 @@ def test_draws_are_a_function_of_seed_epoch_and_scan(data):
     assert len(data.val_set) == 1
 
 
-def test_what_does_not_fit_is_refused(tmp_path, module, data):
+def test_points_and_networks_that_do_not_fit_are_refused(tmp_path, module, data):
     trainer = SimpleNamespace(datamodule=data)
     other = PointPretraining(WaffleIron(16, 3, (4, 4, 4)))
     other._trainer = trainer

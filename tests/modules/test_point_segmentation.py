@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 from lightning import Trainer
-from test_point_pretraining import GRID, cloud
+from point_clouds import GRID, cloud
 from tiny_stages import SILENT
 
 from r3dpa.data import LabelledPointDataModule, LidarDataModule, write_bin

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 import torch
 from resolved_fits import resolved
-from test_unet_stages import tiny_unet
 from tiny_stages import QUIET, group_of, stage_module, tiny_sit, train
+from tiny_unet import tiny_unet
 
 from r3dpa.ablation import make_plan
 from r3dpa.modules import LossWeights
@@ -73,12 +73,12 @@ def tiny_module(stage):
     return stage_module(name, tiny_unet if is_unet else tiny_sit, weights=weights)
 
 
-def test_every_row_is_expected(rows):
+def test_every_row_of_the_tables_is_tested_here(rows):
     assert set(EXPECTED) == set(STARTS) == set(rows)
 
 
 @pytest.mark.parametrize("row", EXPECTED, ids="/".join)
-def test_what_a_row_starts_from(row, rows):
+def test_a_row_starts_from_its_weights(row, rows):
     *_, last = rows[row]
     networks, rgb = STARTS[row]
     assert last.config["model"]["init_args"].get("init_networks") == networks
@@ -89,7 +89,7 @@ def test_what_a_row_starts_from(row, rows):
 
 
 @pytest.mark.parametrize("row", EXPECTED, ids="/".join)
-def test_who_learns_and_who_is_aligned(row, rows):
+def test_a_row_trains_and_aligns_its_networks(row, rows):
     for stage, (trained, aligned) in zip(rows[row], EXPECTED[row], strict=True):
         module = tiny_module(stage)
         module.separates_losses = True

@@ -11,39 +11,12 @@ import pytest
 import torch
 import wandb
 import yaml
+from stage_runs import QUICK, STAGES, load
 
 from r3dpa.cli import main
 from r3dpa.data import read_scan
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
-STAGES = ("vae_alignment", "joint", "flow_matching", "few_step")
-QUICK = ["--trainer.logger=false", "--trainer.limit_val_batches=0", "--trainer.callbacks=[]"]
-
-
-@pytest.fixture
-def from_previous(request, vae_checkpoint):
-    """``from_previous(stage)``: words that name the checkpoint of the stage before, if any."""
-
-    def words(stage):
-        if stage == "vae_alignment":
-            return []
-        few = stage == "few_step"
-        before = request.getfixturevalue("flow_checkpoint") if few else vae_checkpoint
-        return ["--model.init_args.init_from", str(before)]
-
-    return words
-
-
-def load(run_dir):
-    return torch.load(run_dir / "checkpoints" / "last.ckpt", weights_only=True)
-
-
-def assert_equal_runs(run_dir, other_dir, num_steps):
-    """Step, all weights and all moments of the optimizer, bit for bit."""
-    runs = [load(path) for path in (run_dir, other_dir)]
-    assert [run["global_step"] for run in runs] == [num_steps] * 2
-    states = [(run["state_dict"], run["optimizer_states"][0]["state"]) for run in runs]
-    torch.testing.assert_close(*states, atol=0, rtol=0)
 
 
 @pytest.mark.parametrize("stage", STAGES)
@@ -104,18 +77,6 @@ def test_joint_starts_from_the_stage_before(smoke_args, vae_checkpoint, from_pre
         for key in keys:
             torch.testing.assert_close(after[key], before[key])
     torch.testing.assert_close(after["ema.sit.pos_embed"], before["sit.pos_embed"])
-
-
-@pytest.mark.slow
-def test_resume_at_the_end_of_an_epoch_is_exact(smoke_args, from_previous, tmp_path):
-    """An epoch has five batches. Other stops: callbacks/test_resume.py."""
-    more = [*QUICK, *from_previous("joint")]
-    main(smoke_args("joint", tmp_path / "whole", *more, "--trainer.max_steps", "8"))
-    main(smoke_args("joint", tmp_path / "parts", *more, "--trainer.max_steps", "5"))
-    last = str(tmp_path / "parts" / "checkpoints" / "last.ckpt")
-    resume = ["--trainer.max_steps", "8", "--ckpt_path", last]
-    main(smoke_args("joint", tmp_path / "parts", *more, *resume))
-    assert_equal_runs(tmp_path / "whole", tmp_path / "parts", 8)
 
 
 @pytest.mark.ddp

@@ -7,9 +7,8 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from test_gradients import REACH
-from test_stages import QUICK, load
-from tiny_stages import QUIET, TinyData, stage_module, train
+from stage_runs import QUICK, load
+from tiny_stages import QUIET, REACH, TinyData, stage_module, train
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from r3dpa.checkpoints import read_checkpoint, save_checkpoint
@@ -31,7 +30,7 @@ def passes_through(network):
 
 class TestCachedLatents:
     @pytest.mark.parametrize("rotate", [pytest.param(False, marks=pytest.mark.slow), True])
-    def test_steps_are_those_with_the_encoder(
+    def test_steps_with_cached_latents_are_those_with_the_encoder(
         self, rotate, smoke_args, vae_checkpoint, tmp_path, monkeypatch
     ):
         """Three steps with the same draws, without rotation to the last bit but for batching.
@@ -62,14 +61,16 @@ class TestCachedLatents:
         blocks = [key for key in plain if key.startswith("sit.blocks")]
         assert max((before[key] - plain[key]).abs().max() for key in blocks) > 1e-3
 
-    def test_a_fast_dev_run_does_without(self, smoke_args, vae_checkpoint, tmp_path):
+    def test_a_fast_dev_run_writes_no_cache(self, smoke_args, vae_checkpoint, tmp_path):
         more = [*QUICK, "--trainer.fast_dev_run=1"]
         more += ["--model.init_args.init_from", str(vae_checkpoint)]
         main(smoke_args("flow_matching", tmp_path, *more, "--model.init_args.cache_latents=true"))
         assert not (tmp_path / "latents").exists()
 
     @pytest.mark.slow
-    def test_they_are_not_rounded_in_mixed_precision(self, smoke_args, vae_checkpoint, tmp_path):
+    def test_cached_latents_are_not_rounded_in_mixed_precision(
+        self, smoke_args, vae_checkpoint, tmp_path
+    ):
         """Bit for bit those of float32, in a folder of the same name."""
         more = ["--trainer.max_steps=1", "--model.init_args.init_from", str(vae_checkpoint)]
         more += ["--model.init_args.cache_latents=true", "--trainer.precision"]
@@ -104,7 +105,7 @@ class TestLayout:
         assert all(value.is_contiguous() for value in saved.values())
 
     @pytest.mark.parametrize("fused", [False, True])
-    def test_moments_follow_their_weights(self, fused):
+    def test_optimizer_moments_have_the_layout_of_their_weights(self, fused):
         weight = torch.nn.Parameter(torch.randn(4, 3, 2, 2).to(**CHANNELS_LAST))
         optimizer = torch.optim.AdamW([weight])
         weight.grad = torch.randn(4, 3, 2, 2)
@@ -160,14 +161,26 @@ class TestWorkLeftOut:
         assert len(grads) == len(list(module.discriminator.parameters()))
         assert not any(g.count_nonzero() for g in grads)
 
+    @pytest.mark.numerics("loss of weight zero")
+    def test_a_discriminator_of_weight_0_is_not_called(self):
+        weights = LossWeights(adversarial=0.0, discriminator=0.0)
+        module = stage_module("joint", weights=weights)
+        calls = passes_through(module.discriminator)
+        train(module)
+        assert not calls
+
+    @pytest.mark.numerics("parameters a pass does not use")
     @pytest.mark.parametrize(
-        "names", [{"reconstruction"}, {"kl"}, {"adversarial", "vae_alignment", "sit_alignment"}]
+        "names",
+        [{"reconstruction"}, {"kl"}, {"adversarial", "vae_alignment", "sit_alignment"}],
     )
     def test_losses_of_weight_0_are_not_computed(self, names):
         weights = LossWeights(**dict.fromkeys(names, 0.0))
         module = train(stage_module("joint", weights=weights))
         assert module.parts[0].keys() == REACH["joint"].keys() - names
-        projector = any(name.startswith("sit.projector") for name in module.grads[0])
+        trained = {name for name, p in module.named_parameters() if p.requires_grad}
+        assert set(module.grads[0]) == trained  # DDP waits for the gradient of each
+        projector = any(name.startswith("sit.projector") for name in trained)
         assert projector == ("sit_alignment" not in names)
 
     def test_without_denoising_the_last_blocks_rest(self):

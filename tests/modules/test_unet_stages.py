@@ -5,21 +5,16 @@ from __future__ import annotations
 import pytest
 import torch
 import yaml
-from tiny_stages import FEATURE_DIM, QUIET, stage_module, train
+from tiny_stages import QUIET, stage_module, train
+from tiny_unet import SIZES, tiny_unet
 
 from r3dpa.cli import main
 from r3dpa.generation import SamplerConfig, SceneGenerator
 from r3dpa.modules import LossWeights
-from r3dpa.nn import UNet
 
 pytestmark = QUIET
-SIZES = {"in_channels": 4, "channels": 32, "channel_multipliers": [1, 2], "num_res_blocks": 1}
 # In place of the SiT of conf/smoke.yaml: the same latents, grid and features.
 SMOKE = SIZES | {"input_size": [4, 16], "feature_dim": 16, "projector_dim": 32}
-
-
-def tiny_unet():
-    return UNet(**SIZES, input_size=(4, 8), feature_dim=FEATURE_DIM, projector_dim=8)
 
 
 VAE_PARTS = {"vae.encoder", "vae.quant_conv"}

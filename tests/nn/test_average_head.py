@@ -26,6 +26,7 @@ def few_step(average_blocks=1, sit=None):
     return network
 
 
+@pytest.mark.numerics("target time equal to the time")
 @pytest.mark.parametrize("blocks", [1, 2, 3])
 def test_before_training_the_average_velocity_is_the_velocity_bit_for_bit(blocks):
     """At r = t, where it has to be, and by its zero weights at all other targets."""

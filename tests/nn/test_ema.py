@@ -55,6 +55,7 @@ def test_a_thousand_updates_move_by_the_exact_amount(dtype, sit, norm):
     assert spread(sit) == (2.0, 2.0)
 
 
+@pytest.mark.numerics("integer buffers")
 @pytest.mark.parametrize(("buffers", "expected"), [("copy", 5.0), ("decay", 2.0)])
 def test_floating_point_buffers_are_copied_or_decayed(buffers, expected, sit, norm):
     """Statistic 1 becomes 5: copied 5, decayed 0.75 * 1 + 0.25 * 5 = 2. Counts are copied."""

@@ -4,6 +4,9 @@ import copy
 
 import pytest
 import torch
+from draws import drawn
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from torch import nn
 
 from r3dpa.nn.latent_norm import LatentNorm
@@ -90,3 +93,67 @@ def test_half_precision_latents_are_normalised_in_float32():
     twin = LatentNorm(3)
     twin.update(latents.float())
     assert torch.equal(norm.running_var, twin.running_var)
+
+
+FEW = settings(derandomize=True, max_examples=15, deadline=None, database=None)
+
+
+DTYPES = [torch.float32, torch.bfloat16, torch.float16]
+
+
+EXPONENTS = st.lists(st.floats(-6.0, 6.0), min_size=3, max_size=3)
+
+
+def latents_of(scale, mean, seed=0):
+    return mean[:, None, None] + scale[:, None, None] * drawn(seed, 2, len(scale), 4, 6)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.numerics("infinite latent")
+def test_a_variance_beyond_float32_leaves_the_statistics_alone(dtype):
+    """Latents of 1e20 are finite, but their variance of 1e40 is not in float32."""
+    ours, plain = LatentNorm(3), nn.BatchNorm2d(3, affine=False)
+    ours.update(drawn(0, 2, 3, 4, 6).to(dtype))
+    before, far = copy.deepcopy(ours.state_dict()), (1e20 * drawn(1, 2, 3, 4, 6)).to(dtype)
+    assert far.isfinite().all()
+    assert ours.update(far).isfinite().all()
+    torch.testing.assert_close(ours.state_dict(), before, atol=0, rtol=0)
+    for latents in (far, drawn(2, 2, 3, 4, 6)):
+        plain(latents.float())
+    assert not plain.running_var.isfinite().any()
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.numerics("tiny variance")
+def test_denormalising_undoes_normalising_whatever_the_statistics(dtype):
+    """Variances of 1e-6 to 1e6 and means of up to 10 deviations, latents of any precision."""
+    worst = []
+
+    @FEW
+    @given(exponents=EXPONENTS, means=st.lists(st.floats(-10, 10), min_size=3, max_size=3))
+    def check(exponents, means):
+        scale = 10 ** torch.tensor([e / 2 for e in exponents])
+        norm, legacy = LatentNorm(3), LatentNorm(3, legacy_inverse=True)
+        for layer in (norm, legacy):
+            layer.running_var.copy_(scale.square())
+            layer.running_mean.copy_(torch.tensor(means) * scale)
+        latents = latents_of(scale, norm.running_mean).to(dtype)
+        unit = (norm.running_var + norm.eps).sqrt()[:, None, None]
+        restored = norm.denormalise(norm.normalise(latents))
+        assert ((restored - latents.float()) / unit).abs().max() < 1e-5
+        off = (legacy.denormalise(legacy.normalise(latents)) - latents.float()) / unit
+        worst.append(off.abs().max().item())
+
+    check()
+    assert max(worst) > 0.01
+
+
+@pytest.mark.numerics("batch of one")
+def test_statistics_of_one_number_per_channel_are_refused():
+    single = drawn(0, 1, 3, 1, 1)
+    norm = LatentNorm(3)
+    with pytest.raises(ValueError, match=r"at least two values per channel.*larger batch"):
+        norm.update(single)
+    assert not norm.fitted
+    squares = (single - single.mean((0, 2, 3), keepdim=True)).square().sum((0, 2, 3))
+    assert (squares / (single.numel() / 3 - 1)).isnan().all()

@@ -1,8 +1,13 @@
 from __future__ import annotations
 
+import copy
+from itertools import product
+
 import pytest
 import torch
+import torch.distributed as dist
 import torch.nn.functional as F
+from draws import drawn
 from torch import nn
 
 from r3dpa.nn.layers import AttentionBlock, GroupNorm, SyncedBatchNorm2d, Upsample, downsample
@@ -53,18 +58,71 @@ def test_attention_with_large_queries_survives_half_precision():
     assert (query.transpose(1, 2) @ query).isinf().any()  # scaled after the product
 
 
-def test_synced_batch_norm_in_one_process_is_batch_norm():
+@pytest.fixture
+def process_group(tmp_path):
+    """A process group of this process alone."""
+    dist.init_process_group("gloo", f"file://{tmp_path}/rendezvous", rank=0, world_size=1)
+    yield
+    dist.destroy_process_group()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("group", [False, True], ids=["alone", "group"])
+@pytest.mark.numerics("synchronised batch norm in one process")
+def test_synced_batch_norm_in_one_process_is_batch_norm(group, dtype, request):
+    if group:
+        request.getfixturevalue("process_group")
     ours, plain = SyncedBatchNorm2d(3), nn.BatchNorm2d(3)
     assert list(ours.state_dict()) == list(plain.state_dict())
-    for _ in range(3):
-        image = torch.randn(2, 3, 4, 5)
+    for seed in range(3):
+        image = drawn(seed, 2, 3, 4, 5).to(dtype)
         assert torch.equal(ours(image), plain(image))
     torch.testing.assert_close(ours.state_dict(), plain.state_dict(), atol=0, rtol=1e-6)
     ours.load_state_dict(plain.state_dict())
     assert torch.equal(ours.eval()(image), plain.eval()(image))
+    if group:
+        with pytest.raises((ValueError, RuntimeError), match="SyncBatchNorm expected input tensor"):
+            nn.SyncBatchNorm(3)(image)
 
 
 def test_half_precision_batch_norm_keeps_its_dtype():
     with torch.autocast("cpu", torch.bfloat16):
         image = F.conv2d(torch.randn(2, 1, 8, 8), torch.randn(3, 1, 3, 3))
         assert SyncedBatchNorm2d(3)(image).dtype == image.dtype == torch.bfloat16
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("value", [torch.inf, torch.nan])
+@pytest.mark.numerics("batch norm on real and fake batches")
+def test_a_broken_reconstruction_leaves_the_running_statistics_alone(value, dtype):
+    ours, plain = SyncedBatchNorm2d(3), nn.BatchNorm2d(3)
+    good, broken = drawn(0, 2, 3, 4, 6).to(dtype), drawn(1, 2, 3, 4, 6).to(dtype)
+    broken[0, 1, 2, 3] = value
+    for layer in (ours, plain):
+        layer(good)
+    before = copy.deepcopy(ours.state_dict())
+    assert not ours(broken).isfinite().all()  # the loss tells, and the step is dropped
+    torch.testing.assert_close(ours.state_dict(), before, atol=0, rtol=0)
+    plain(broken)
+    plain(good)
+    assert not plain.running_var.isfinite().all()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float16])
+@pytest.mark.numerics("group norm of a constant image")
+def test_group_norm_of_any_constant_is_finite_both_ways(dtype):
+    """A scan of no or of few returns is constant in every layer, but for as many pixels."""
+    broken = 0
+    for constant, returns in product((-1.0, 0.7, 3.3, 31.1, 300.7, 6e4), (0, 1, 15, 100)):
+        image = torch.full((1, 32, 6, 20), constant, dtype=dtype)
+        image.flatten(2)[..., :returns] *= 1.01
+        values = image[0, 0].clone()
+        image.requires_grad_()
+        result = GroupNorm(32).to(dtype)(image)
+        result.square().sum().backward()
+        assert result.dtype == dtype
+        assert result.isfinite().all()
+        assert image.grad.isfinite().all()
+        variance = values.square().mean() - values.mean().square()
+        broken += not torch.rsqrt(variance + 1e-6).isfinite()
+    assert broken

@@ -4,6 +4,8 @@ import copy
 
 import pytest
 import torch
+from draws import drawn
+from torch import nn
 from torch.distributions import Normal, kl_divergence
 
 from r3dpa.nn import PatchDiscriminator
@@ -116,3 +118,53 @@ def test_fresh_weights_follow_pix2pix():
             assert abs(module.weight.std().item() - 0.02) < tolerance
         elif isinstance(module, torch.nn.BatchNorm2d):
             assert abs(module.weight.mean().item() - 1.0) < 0.02
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize(("start", "weight"), [(25.0, 1e-6), (-35.0, 1.0)])
+@pytest.mark.numerics("log variance beyond its clamp")
+def test_the_divergence_pulls_an_escaped_log_variance_back(start, weight, dtype):
+    """In steps of at most 0.5, as clipping to 1 with rate 0.5 makes them."""
+
+    def after_50_steps(divergence):
+        moments = torch.zeros(1, 2, 1, 1, dtype=dtype)
+        moments[0, 1] = start
+        moments.requires_grad_()
+        optimiser = torch.optim.SGD([moments], lr=0.5)
+        for _ in range(50):
+            optimiser.zero_grad()
+            (weight * divergence(moments)).sum().backward()
+            nn.utils.clip_grad_norm_(moments, 1.0)
+            optimiser.step()
+        return moments[0, 1].item()
+
+    def with_plain_clamp(moments):
+        mean, logvar = moments.float().chunk(2, dim=1)
+        logvar = logvar.clamp(-30.0, 20.0)
+        return 0.5 * (mean.square() + logvar.exp() - 1 - logvar).sum()
+
+    assert -30 < after_50_steps(lambda moments: Posterior(moments).kl()) < 20
+    assert after_50_steps(with_plain_clamp) == start
+
+
+@pytest.mark.parametrize("how", ["float32", "weights", "autocast"])
+@pytest.mark.numerics("decoding in half precision")
+def test_far_latents_decode_to_finite_images(how, vae):
+    """Latents of 10 deviations through layers that, as trained ones do, enlarge them."""
+    with torch.no_grad():
+        vae.decoder.conv_in.weight *= 2e4
+    latents = 10 * drawn(0, 2, 4, 4, 8)
+    with torch.no_grad():
+        expected = vae.decode(latents)
+        ours = copy.deepcopy(vae)
+        if how == "weights":
+            ours.decoder_to_bfloat16_()
+        with torch.autocast("cpu", torch.bfloat16, enabled=how == "autocast"):
+            decoded = ours.decode(latents)
+        with torch.autocast("cpu", torch.float16):
+            broken = vae.decode(latents)
+    assert decoded.dtype == torch.float32
+    assert decoded.isfinite().all()
+    error = (decoded - expected).norm() / expected.norm()
+    assert error < (1e-6 if how == "float32" else 0.05)
+    assert (~broken.isfinite()).float().mean() > 0.5

@@ -241,7 +241,7 @@ def test_columns_wrap_around_but_for_the_position_bias():
         torch.testing.assert_close(found, value, atol=1e-5, rtol=1e-5)
 
 
-def test_attention_at_chosen_resolutions():
+def test_attention_blocks_stand_at_the_chosen_resolutions():
     """LiDM's names: the residual block is layer 0, attention layer 1, a step up the last one."""
     unet = build(UNet, channel_multipliers=(1, 2, 1), attention_resolutions=[2])
     letters = {"in_layers": "r", "norm": "a", "op": "-", "up": "+"}  # by the first part of a layer

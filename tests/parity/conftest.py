@@ -75,15 +75,20 @@ def baseline_case(baseline_dir):
     return case_loader(baseline_dir)
 
 
-@pytest.fixture(scope="session")
-def baseline_listing(baseline_dir):
-    """``baseline_listing(name)``: a recorded state-dict listing of a baseline."""
+def listing_loader(folder: Path, shipped: Path):
+    """``load(name)``: a recorded state-dict listing, which no seed or size changes."""
 
     def load(name: str):
-        folder = baseline_dir if (baseline_dir / f"{name}.json").is_file() else BASELINES
-        return json.loads((folder / f"{name}.json").read_text())
+        file = folder / f"{name}.json"
+        return json.loads((file if file.is_file() else shipped / file.name).read_text())
 
     return load
+
+
+@pytest.fixture(scope="session")
+def baseline_listing(baseline_dir):
+    """``baseline_listing(name)``: a listing of a baseline."""
+    return listing_loader(baseline_dir, BASELINES)
 
 
 @pytest.fixture(scope="session")
@@ -96,13 +101,8 @@ def baseline_dir(pytestconfig, parity_dir) -> Path:
 
 @pytest.fixture(scope="session")
 def official_listing(parity_dir):
-    """``official_listing(name)``: a recorded state-dict listing, which no seed or size changes."""
-
-    def load(name: str):
-        folder = parity_dir if (parity_dir / f"{name}.json").is_file() else SYNTHETIC
-        return json.loads((folder / f"{name}.json").read_text())
-
-    return load
+    """``official_listing(name)``: a listing of R3DPA."""
+    return listing_loader(parity_dir, SYNTHETIC)
 
 
 def assert_close(actual, expected, atol=1e-5, rtol=1e-5):

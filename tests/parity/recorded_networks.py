@@ -105,3 +105,15 @@ def check(case, key, found, atol=1e-5):
         **scaled(atol)(key, case[key]),
         msg=lambda text: f"{key}: {text}",
     )
+
+
+def under(prefix, outputs):
+    """The outputs under names that begin with a prefix, without their graph."""
+    return {
+        prefix + key: value.detach() if isinstance(value, torch.Tensor) else value
+        for key, value in outputs.items()
+    }
+
+
+def count(network):
+    return sum(parameter.numel() for parameter in network.parameters())

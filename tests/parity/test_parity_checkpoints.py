@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from recorded_networks import weights_of
+from recorded_networks import count, weights_of
 
 from r3dpa.checkpoints import (
     NetworkState,
@@ -52,10 +52,6 @@ def through_our_networks(checkpoint):
         network.load_state_dict(state.state_dict, strict=True, assign=True)
         networks[name] = type(state)(state.class_path, state.init_args, network.state_dict())
     return type(checkpoint)(**{**vars(checkpoint), "networks": networks})
-
-
-def count(network):
-    return sum(parameter.numel() for parameter in network.parameters())
 
 
 def assert_defaults(state, *names):

@@ -8,7 +8,7 @@ import tarfile
 import pytest
 import torch
 import yaml
-from recorded_networks import scaled, weights_of
+from recorded_networks import count, scaled, under, weights_of
 from torch.nn.functional import adaptive_avg_pool2d
 
 from r3dpa.geometry import (
@@ -97,7 +97,7 @@ def test_network(network_case, compare):
     case, compute = network_case
     compare(
         case,
-        {f"out/{key}": value for key, value in compute(case).items()},
+        under("out/", compute(case)),
         tolerance=scaled(2e-5),
     )
 
@@ -194,7 +194,7 @@ def test_metrics(name, baseline_case, compare):
             return {"atol": 0, "rtol": 1e-5}
         return scaled(1e-6)(key, expected)
 
-    compare(case, {f"out/{key}": value for key, value in results.items()}, tolerance=tolerance)
+    compare(case, under("out/", results), tolerance=tolerance)
 
 
 @pytest.mark.parametrize("layers", ["53_frd", "21_frid"])
@@ -211,7 +211,7 @@ def test_listings_load_under_both_names(layers, baseline_listing):
     theirs = {backwards[name]: value for name, value in weights.items()}
     for named in (weights, theirs):
         network = RangeNet.from_weights(named)
-        assert sum(p.numel() for p in network.parameters()) == ours["param_count"]
+        assert count(network) == ours["param_count"]
         assert torch.equal(network.get_parameter("dec1.conv.0.bias"), weights["dec1.conv.0.bias"])
     with pytest.raises(ValueError, match=r"1 missing.*enc5.conv.0.weight"):
         RangeNet.from_weights({k: v for k, v in theirs.items() if k != "enc5.conv.weight"})
@@ -224,7 +224,7 @@ def test_listing_of_pointnet(baseline_listing):
     shapes = {key: list(value.shape) for key, value in network.state_dict().items()}
     assert shapes == listing["state_dict"]
     assert network.dim == listing["feature_width"]
-    assert sum(p.numel() for p in network.parameters()) == listing["param_count"]
+    assert count(network) == listing["param_count"]
 
 
 def test_archives_and_folders_are_read(tmp_path, baseline_case):

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from recorded_networks import scaled, weights_of, with_outputs
+from recorded_networks import count, scaled, under, weights_of, with_outputs
 
 from r3dpa.baselines.diffusion_paths import StepPath, inpaint
 from r3dpa.baselines.lidm import LiDM, ReleasedDDIM, released_times
@@ -71,7 +71,7 @@ def of_network(case, lidm) -> dict:
         "y": y,
         "t_emb": time_frequencies(time.float(), unet.channels),
         "roll_max_err": torch.tensor([turned[0], case["out/roll_max_err"][1].item()]),
-        "n_parameters": sum(p.numel() for p in unet.parameters()),
+        "n_parameters": count(unet),
     }
 
 
@@ -196,7 +196,7 @@ def test_unet(unet_case, lidm, compare):
         results |= part(unet_case, lidm)
     compare(
         unet_case,
-        {f"out/{key}": value for key, value in results.items()},
+        under("out/", results),
         tolerance=scaled(2e-5),
     )
 
@@ -339,7 +339,7 @@ def test_first_stage(stage_case, compare):
         "rec": network.predict(quantised.latents),
         "interface_decode": network.decode(case["in/z"]),
         "interface_decode_no_quantize": network.image_of(network.predict(case["in/z"])),
-        "n_parameters": sum(p.numel() for p in network.parameters()),
+        "n_parameters": count(network),
     }
     for variant in case.config["loss_variants"]:
         results |= of_variant(case, variant)
@@ -353,7 +353,7 @@ def test_first_stage(stage_case, compare):
         of_weight = key.endswith(("d_weight", "total_loss")) or "/grad/" in key
         return scaled(1e-4 if of_weight else 1e-5)(key, expected)
 
-    compare(case, {f"out/{key}": value for key, value in results.items()}, tolerance=tolerance)
+    compare(case, under("out/", results), tolerance=tolerance)
 
 
 def test_geometry_as_meant_reads_empty_pixels_as_the_least_range(stage_case):

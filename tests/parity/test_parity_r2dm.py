@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 import torch.nn.functional as F
-from recorded_networks import check, scaled, with_outputs
+from recorded_networks import check, count, scaled, with_outputs
 
 from r3dpa.baselines.base import AveragedNetwork
 from r3dpa.baselines.diffusion import (
@@ -91,7 +91,7 @@ def test_r2dm_unet_forward_and_gradients(unet_case, unet, compare):
     for key in case.keys("out/grad/"):
         if key != "out/grad/x":
             results[key] = gradient(network, key.removeprefix("out/grad/"))
-    results["out/n_parameters"] = torch.tensor(sum(p.numel() for p in network.parameters()))
+    results["out/n_parameters"] = torch.tensor(count(network))
     results["out/hdl64_ray_angles"] = hdl64e_angles(size)
     for encoding in ("spherical_harmonics", "fourier_features"):
         results[f"out/enc_{encoding}"] = encode_angles(angles, encoding, size)
@@ -376,7 +376,7 @@ def test_r2dm_diffusion_every_array_is_compared(diffusion, unet_case):
     assert case["out/state_dict_key_count"] > count  # its constants are no weights here
 
 
-def test_ema(baseline_case):
+def test_ema_outputs(baseline_case):
     case = baseline_case("ema")
     config = case.config
     network = torch.nn.Linear(*case["in/initial_weight"].shape[::-1], bias=False)
@@ -441,7 +441,7 @@ def test_r2dm_released_layout_loads_strictly(baseline_listing, tmp_path):
     checkpoint = read_checkpoint(path)
     with torch.device("meta"):
         network = checkpoint.network("ema_network").new()
-    assert sum(p.numel() for p in network.parameters()) == listing["param_count"] == 31_099_650
+    assert count(network) == listing["param_count"] == 31_099_650
     assert (checkpoint.stage, checkpoint.step) == ("r2dm", 300_000)
     codec = checkpoint.geometry["codec"]
     assert codec["encoding"] == "log2"

@@ -7,7 +7,7 @@ import copy
 import pytest
 import torch
 from dopri5 import dopri5
-from recorded_networks import scaled, weights_of, with_outputs
+from recorded_networks import count, scaled, weights_of, with_outputs
 
 from r3dpa.baselines import ADMUNet, EfficientUNet
 from r3dpa.baselines.diffusion import sample_errors
@@ -70,7 +70,7 @@ def outputs_of(case, network):
     results = {f"out/act/{name}": value for name, value in activations.items()}
     scalar_time = torch.full((len(image),), _SCALAR_TIME)
     results |= {"out/y": velocity, "out/y_scalar_time": official(network, image, scalar_time)}
-    results["out/n_parameters"] = sum(p.numel() for p in network.parameters())
+    results["out/n_parameters"] = count(network)
     return results, image, velocity
 
 
@@ -82,7 +82,7 @@ def gradients_of(network, loss, **options):
     return found
 
 
-def test_hdit(hdit, compare):
+def test_hdit_outputs(hdit, compare):
     case, network = hdit
     results, image, velocity = outputs_of(case, network)
     loss = (velocity - case["in/target"]).square().mean()
@@ -144,7 +144,7 @@ def test_unet(kind, baseline_case, compare):
     network = unet_of(kind, case)
     results = {
         "out/y": official(network, case["in/x"], case["in/t"]),
-        "out/n_parameters": sum(p.numel() for p in network.parameters()),
+        "out/n_parameters": count(network),
     }
     if kind is ADMUNet:
         block = network.get_submodule("down_blocks.1")
@@ -193,14 +193,14 @@ def test_released_layouts_are_read_strictly(name, baseline_listing, tmp_path):
     assert checkpoint.settings == {"num_steps": 4}
     with torch.device("meta"):
         network = checkpoint.network("ema_network").new()
-    assert sum(p.numel() for p in network.parameters()) == listing[name]["param_count"]
+    assert count(network) == listing[name]["param_count"]
     name = next(iter(content["weights"]))
     del content["weights"][name]
     with pytest.raises((ValueError, KeyError), match=name):
         from_r2flow(content, tmp_path / "broken.pth")
 
 
-def test_flow(hdit, baseline_case, close):
+def test_flow_outputs(hdit, baseline_case, close):
     case, network = baseline_case("r2flow_flow"), hdit[1]
     geometry = ScanGeometry.from_dict(image_geometry(network.coords, "log_depth"))
     results = training_of(case, network)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from recorded_networks import count
 
 from r3dpa.features.official import key_renamer, load_strictly
 from r3dpa.geometry import LidarSensor
@@ -108,7 +109,7 @@ def test_rangevit_released_sizes(official_listing, name):
         for key, shape in shapes.items()
         if ".kpclassifier." in key and not key.endswith(STATISTICS)
     )
-    own = sum(value.numel() for value in network.parameters())
+    own = count(network)
     assert own + classifier == listing["param_count"]
     assert network.dim == listing["feature_dim"]
     assert [network.sensor.beams, network.sensor.columns] == config["original_image_size"]
@@ -164,5 +165,5 @@ def test_liploc_encoder_released_sizes(official_listing):
         network = LIPLoc()
     weights = empty(listing["state_dict"])
     load_strictly(network, weights, key_renamer(liploc._NAMES))
-    assert sum(value.numel() for value in network.parameters()) == listing["param_count"]
+    assert count(network) == listing["param_count"]
     assert network.dim == listing["feature_dim"]

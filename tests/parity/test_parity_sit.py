@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from recorded_networks import build_norm, build_sit, our_name, training_pass
+from recorded_networks import build_norm, build_sit, our_name, training_pass, under
 
 from r3dpa.flow import FeatureGuidance, FeatureTarget, Interpolant
 from r3dpa.losses import alignment_loss
@@ -15,10 +15,6 @@ from r3dpa.nn.velocity_network import time_frequencies
 @pytest.fixture(scope="module")
 def case(load_case):
     return load_case("sit")
-
-
-def under(prefix, outputs):
-    return {prefix + key: value.detach() for key, value in outputs.items()}
 
 
 def embeddings(case):

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from recorded_networks import with_outputs
+from recorded_networks import count, with_outputs
 
 from r3dpa.features.official import load_strictly
 from r3dpa.metrics.networks.minkowski import (
@@ -194,7 +194,7 @@ def test_released_sizes(official_listing, name, rate):
         network = NETWORKS[name](widths)
         weights = {key: torch.empty(shape) for key, shape in listing["state_dict"].items()}
     load_strictly(network, weights, official_name)
-    assert sum(p.numel() for p in network.parameters()) == listing["param_count"]
+    assert count(network) == listing["param_count"]
     assert widths[-1] * 16 == listing["metric_feature_dim"]
     if rate == "0.5":
         assert NETWORKS[name]().widths == widths  # the defaults are those of the metric

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from recorded_networks import our_name, training_pass, weights_of
+from recorded_networks import count, our_name, training_pass, weights_of
 
 from r3dpa.checkpoints import from_official, to_official
 from r3dpa.flow import Interpolant
@@ -114,8 +114,8 @@ def test_unet_official_checkpoints_come_and_go_key_by_key(official_listing, name
         unet = state.new()
     assert isinstance(unet, UNet)
     assert {key: state.arguments[key] for key in SIZES[name]} == SIZES[name]
-    assert sum(p.numel() for p in unet.parameters()) == listing[name]["param_count_total"]
-    projector = sum(p.numel() for p in unet.projector.parameters())
+    assert count(unet) == listing[name]["param_count_total"]
+    projector = count(unet.projector)
     assert projector == listing[name]["param_count_projectors"]
     assert list(unet.grid_size) == listing["_notes"]["grid_for_h2p4d8"]
     assert checkpoint.geometry["grid_size"] == list(unet.grid_size)

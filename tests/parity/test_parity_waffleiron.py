@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from recorded_networks import count
 
 from r3dpa.features import (
     PointCloudBatch,
@@ -161,6 +162,6 @@ def test_released_sizes(official_listing):
         network = WaffleIron(head_dim=config["nb_class"])
         weights = {key: torch.empty(shape) for key, shape in listing["state_dict"].items()}
     load_strictly(network, weights, official_name)
-    assert sum(p.numel() for p in network.parameters()) == listing["param_count"] == 60_222_996
-    head = sum(p.numel() for p in network.head.parameters())
+    assert count(network) == listing["param_count"] == 60_222_996
+    head = count(network.head)
     assert listing["param_count"] - head == listing["param_count_without_classif"]

@@ -61,7 +61,7 @@ def test_encoded_picture_spans_the_bytes_and_rounds_down():
     assert viz.encoded_picture(image).tolist() == [[0, 0, 127, 255, 255]]
 
 
-def test_from_above_forward_is_up_and_left_is_left():
+def test_birds_eye_view_shows_forward_up_and_left_left():
     points = torch.tensor([[0.0, 0.0, 0.0], [20.0, 0.0, 0.0], [0.0, 20.0, 0.0]])
     colours = torch.tensor(np.stack([RED, GREEN, BLUE]))
     picture = viz.birds_eye_picture(points, extent_m=50, pixels=100, colours=colours)
@@ -72,7 +72,7 @@ def test_from_above_forward_is_up_and_left_is_left():
     assert is_background(viz.birds_eye_picture(absent, extent_m=50)).all()
 
 
-def test_from_above_the_highest_point_shows_in_any_order():
+def test_birds_eye_view_shows_the_highest_point_in_any_order():
     points = np.array([[3.0, 3.0, 2.0], [3.0, 3.0, -1.0]])
     for order in ([0, 1], [1, 0]):
         picture = viz.birds_eye_picture(points[order], colours=np.stack([RED, BLUE])[order])

@@ -13,13 +13,12 @@ import re
 import subprocess
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
-import torch
 import torch.nn.functional as F
 import yaml
 from torch import Tensor, nn
@@ -27,7 +26,7 @@ from torch import Tensor, nn
 COMMIT = "aa08e6d"
 """Commit of valeoai/R3DPA that is compared with."""
 
-_PACKAGES = ("generate", "train_repae", "samplers", "utils", "dataset_kitti", "models", "loss")
+_PACKAGES = ("generate", "samplers", "utils", "dataset_kitti", "models", "loss")
 
 
 class Overlay:
@@ -66,7 +65,6 @@ def load_official(repo: Path) -> OfficialCode:
     with _importing_from(repo, replaced), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Deprecated names of torch are theirs to change.
         importlib.import_module("generate")
-        importlib.import_module("train_repae")
         modules = {
             name: module
             for name, module in sys.modules.items()
@@ -179,45 +177,6 @@ class Mlp(nn.Module):
 
     def forward(self, tokens: Tensor) -> Tensor:
         return self.fc2(self.act(self.fc1(tokens)))
-
-
-class OneProcess:
-    """What a training script asks of ``accelerate.Accelerator``, for one process on the CPU."""
-
-    is_main_process = is_local_main_process = use_distributed = False
-    sync_gradients = True
-    process_index, num_processes = 0, 1
-    device = torch.device("cpu")
-    clip_grad_norm_ = staticmethod(nn.utils.clip_grad_norm_)
-
-    def __init__(self, clock: Callable[[], float]) -> None:
-        self.clock = clock
-        self.seconds: list[float] = []
-
-    @contextmanager
-    def accumulate(self, models: list[nn.Module]) -> Iterator[None]:
-        start = self.clock()
-        yield
-        self.seconds.append(self.clock() - start)
-
-    def autocast(self) -> nullcontext[None]:
-        return nullcontext()
-
-    def backward(self, loss: Tensor) -> None:
-        loss.backward()
-
-    def prepare(self, *things: Any) -> tuple[Any, ...]:
-        return things
-
-    def unwrap_model(self, model: nn.Module) -> nn.Module:
-        return model
-
-    def gather(self, values: Tensor) -> Tensor:
-        return values
-
-    def wait_for_everyone(self) -> None: ...
-
-    def end_training(self) -> None: ...
 
 
 class _Dot(dict):

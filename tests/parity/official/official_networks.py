@@ -1,4 +1,4 @@
-"""Networks with the same weights on both sides, and what their samplers are off by."""
+"""Networks with the same weights on both sides, and how far their results are apart."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from official_scripts import official_sit, official_vae
 from torch import Tensor
 
 from r3dpa.checkpoints import Checkpoint, NetworkState, to_official
-from r3dpa.flow import Velocity
 from r3dpa.flow.noise import scene_random
 from r3dpa.geometry import LidarSensor, RangeCodec
 from r3dpa.nn import VAE, LatentNorm, PatchDiscriminator, SiT
@@ -66,18 +65,6 @@ def vaes(code: OfficialCode, networks: Checkpoint) -> Pair:
     theirs = official_vae(code, networks)
     theirs.load_state_dict(to_official(networks)["vae"])
     return Pair(theirs.eval(), networks.network("vae").build().eval())
-
-
-def at_times(sit: SiT, times: Tensor) -> Velocity:
-    """Velocity whose k-th call is at the k-th time, with modulations computed here at once."""
-    with torch.inference_mode():
-        rows = iter(sit.modulations(times.float()).split(1))
-
-    @torch.inference_mode()
-    def velocity(latents: Tensor, time: Tensor) -> Tensor:
-        return sit.velocity_at(latents.float(), next(rows))
-
-    return velocity
 
 
 def noise_of(networks: Checkpoint, num: int, seed: int) -> Tensor:

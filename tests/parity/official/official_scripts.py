@@ -1,7 +1,7 @@
-"""The official sampler script and training script, run as they are on the CPU with given weights.
+"""The official sampler script, run as it is on the CPU with given weights.
 
-Both scripts expect CUDA, several processes and files of data. What they would ask of those is
-answered here by overlays of the modules they import; their own lines run unchanged.
+The script expects CUDA and several processes. Overlays of the modules that it imports stand in for
+both; its own lines run unchanged.
 """
 
 from __future__ import annotations
@@ -9,28 +9,20 @@ from __future__ import annotations
 import contextlib
 import io
 import json
-import logging
-import time
-import warnings
 from argparse import Namespace
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from unittest.mock import Mock
 
-import lightning as L
 import numpy as np
 import torch
-from official_code import OfficialCode, OneProcess, Overlay
-from torch import Tensor, nn
-from torch.utils.data import DataLoader
+from official_code import OfficialCode, Overlay
+from torch import nn
 
 from r3dpa.checkpoints import Checkpoint, to_official
-from r3dpa.modules import JointAlignment
-from r3dpa.modules.stage import PathDraws
 
 _MODEL, _VAE = "r3dpa/2", "h2p4d8"
 _STRIDE = (4, 8)
@@ -145,95 +137,6 @@ def write_official_scenes(code, checkpoint, experiment, out, num, batch_size, st
     return np.load(images)["arr_0"][:, 0]
 
 
-class Trained(NamedTuple):
-    """What some training steps took and led to."""
-
-    seconds: list[float]
-    weights: dict[str, dict[str, Tensor]]
-
-
-def train_official(code, checkpoint, image, features, draws, steps, folder) -> Trained:
-    """Runs ``main`` of the official ``train_repae.py`` for some steps on one batch."""
-    script = code["train_repae"]
-    weights, process = to_official(checkpoint), OneProcess(time.perf_counter)
-    networks: dict[str, nn.Module] = {}
-    posterior_noise, times, noise = draws
-
-    def keep(name: str, network: nn.Module, state: dict[str, Tensor]) -> nn.Module:
-        network.load_state_dict(state)
-        networks[name] = network
-        return network
-
-    def loss(config: Any) -> nn.Module:
-        function = code["loss.losses"].ReconstructionLoss_Single_Stage(config)
-        keep("discriminator", function.discriminator, weights["discriminator"])
-        return function
-
-    batch = {"image": image, "features": features}
-    samples = [dict(zip(batch, pair, strict=True)) for pair in zip(image, features, strict=True)]
-    with (
-        replaced(
-            script,
-            Accelerator=lambda **_: process,
-            SiT_models={
-                _MODEL: lambda **given: keep(
-                    "sit", official_sit(code, checkpoint, **given), weights["model"]
-                )
-            },
-            vae_models={_VAE: lambda: keep("vae", official_vae(code, checkpoint), weights["vae"])},
-            ReconstructionLoss_Single_Stage=loss,
-            KITTI360=lambda *_, **__: samples,
-            euler_sampler=lambda model, latents, *_, **__: latents[..., : _STRIDE[1]],
-            logging=logging.getLogger(__name__),
-        ),
-        replaced(
-            code["models.autoencoder"],
-            torch=Overlay(torch, randn=lambda shape, device: posterior_noise),
-        ),
-        replaced(
-            code["models.sit"],
-            torch=Overlay(
-                torch, rand=lambda shape: times.view(shape), randn_like=lambda values: noise
-            ),
-        ),
-        contextlib.redirect_stdout(io.StringIO()),
-        warnings.catch_warnings(),
-    ):
-        warnings.simplefilter("ignore")
-        script.main(_training_options(code, checkpoint, image, steps, folder))
-    return Trained(
-        process.seconds, {name: network.state_dict() for name, network in networks.items()}
-    )
-
-
-def _training_options(code, checkpoint, image, steps, folder):
-    """Those of the second stage as published, but without compiling and in full precision."""
-    configs, sizes = code.repo / "configs", checkpoint.network("sit").arguments
-    options = code["train_repae"].parse_args(["--exp-name", "joint"])
-    vars(options).update(
-        output_dir=str(folder),
-        mixed_precision="no",
-        allow_tf32=False,
-        compile=False,
-        seed=None,
-        model=_MODEL,
-        vae=_VAE,
-        resolution=list(image.shape[-2:]),
-        num_classes=sizes["num_classes"],
-        encoder_depth=sizes["alignment_depth"],
-        cfg_prob=0.0,
-        qk_norm=sizes["qk_norm"],
-        dataset_config=str(configs / "kitti.yaml"),
-        batch_size=len(image),
-        num_workers=0,
-        loss_cfg_path=str(configs / "l1_lpips_kl_gan.yaml"),
-        adam_weight_decay=0.03,
-        epochs=steps,
-        max_train_steps=steps,
-    )
-    return options
-
-
 @contextmanager
 def replaced(module: Any, **names: Any) -> Iterator[None]:
     """Other content of a module for a while."""
@@ -243,65 +146,3 @@ def replaced(module: Any, **names: Any) -> Iterator[None]:
         yield
     finally:
         vars(module).update(before)
-
-
-class _GivenDraws(JointAlignment):
-    """Joint training without a data module, with the same draws in every step."""
-
-    draws: PathDraws
-
-    def setup(self, stage: str) -> None:
-        """Needs no scans: the batch is given."""
-
-    def draw_path(self, num_scans: int, batch_number: int | None = None) -> PathDraws:
-        return self.draws
-
-
-class _Timer(L.Callback):
-    """Time of each step: losses, backward, clipping, optimiser and averages."""
-
-    def __init__(self, clock: Callable[[], float]) -> None:
-        self.clock = clock
-        self.seconds: list[float] = []
-        self.start = 0.0
-
-    def on_train_batch_start(self, *args: Any) -> None:
-        self.start = self.clock()
-
-    def on_train_batch_end(self, *args: Any) -> None:
-        self.seconds.append(self.clock() - self.start)
-
-
-def train_ours(checkpoint, image, features, draws, steps) -> Trained:
-    """Trains as `train_official` does, by a Trainer with one optimiser and one backward pass."""
-    networks: dict[str, Any] = {
-        name: checkpoint.network(name).build()
-        for name in ("vae", "sit", "discriminator", "latent_norm")
-    }
-    module = _GivenDraws(**networks, ema_buffers="decay")
-    module.draws = PathDraws(*draws)
-    timer = _Timer(time.perf_counter)
-    batch = {"range_image": image, "feature_grid": features}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # advice on loaders and loggers
-        trainer = L.Trainer(
-            accelerator="cpu",
-            max_steps=steps,
-            gradient_clip_val=1.0,
-            callbacks=[timer],
-            logger=False,
-            enable_checkpointing=False,
-            enable_progress_bar=False,
-            enable_model_summary=False,
-        )
-        trainer.fit(module, DataLoader([batch] * steps, batch_size=None))
-    states = {
-        name: replace(checkpoint.network(name), state_dict=network.state_dict())
-        for name, network in networks.items()
-    }
-    content = to_official(Checkpoint(checkpoint.path, checkpoint.stage, states))
-    weights = {
-        ours: {key: value.detach() for key, value in content[theirs].items()}
-        for ours, theirs in (("vae", "vae"), ("sit", "model"), ("discriminator", "discriminator"))
-    }
-    return Trained(timer.seconds, weights)

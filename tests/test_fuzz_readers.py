@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from fuzz_readers import Hang, Reader, fuzz, readers
 
+pytestmark = pytest.mark.fuzz
 INPUTS = int(os.environ.get("FUZZ_INPUTS", "20"))  # for each reader
 
 

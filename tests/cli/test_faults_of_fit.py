@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import signal
 from functools import partial
@@ -21,6 +22,9 @@ from fault_commands import (
     pause,
 )
 
+from r3dpa.cli import main
+
+pytestmark = pytest.mark.faults
 STEP = "r3dpa.modules.VAEAlignment.training_step"
 TERMINATE, INTERRUPT = (
     partial(signal.raise_signal, number) for number in (signal.SIGTERM, signal.SIGINT)
@@ -67,7 +71,7 @@ def goes_on(ended, scans_folder, undisturbed):
 
 
 class TestStopped:
-    def test_at_the_end_of_a_step(self, faulty, goes_on):
+    def test_a_stop_signal_ends_the_run_after_its_step(self, faulty, goes_on):
         """Once in the second step, and resumed in the first of the two batches of the third."""
         stops = ((INTERRUPT, 3, 130, "SIGINT", 2), (TERMINATE, 1, 143, "SIGTERM", 3))
         for fault, call, number, name, step in stops:
@@ -81,7 +85,7 @@ class TestStopped:
         goes_on(run_dir)
 
     @pytest.mark.slow
-    def test_while_a_checkpoint_is_written(self, faulty, goes_on):
+    def test_a_stop_signal_lets_a_checkpoint_be_written(self, faulty, goes_on):
         run_dir, status, _ = faulty(At("torch.save", TERMINATE, 1))
         assert (status, step_of(last(run_dir))) == (143, 2)
         goes_on(run_dir)
@@ -93,7 +97,9 @@ class TestStopped:
         assert "stopped by" not in seen
 
     @pytest.mark.slow
-    def test_in_a_validation(self, scans_folder, tmp_path, ended, faulty):
+    def test_a_stop_signal_ends_a_validation_after_its_batch(
+        self, scans_folder, tmp_path, ended, faulty
+    ):
         """It ends after the next batch, not after minutes; the rest is validated on resuming."""
         more = ["--trainer.limit_val_batches=4", "--trainer.val_check_interval=6"]
         more += ["--data.init_args.val_every=2", "--data.init_args.batch_size=1"]
@@ -111,7 +117,7 @@ class TestStopped:
 @pytest.mark.slow
 class TestKilled:
     @pytest.mark.parametrize("call", [1, 6])
-    def test_between_checkpoints(self, call, faulty, goes_on):
+    def test_a_run_killed_between_checkpoints_goes_on(self, call, faulty, goes_on):
         """Before the first one, too: ``last`` then means from the start."""
         run_dir, status, _ = faulty(At(STEP, partial(signal.raise_signal, signal.SIGKILL), call))
         assert status == -signal.SIGKILL
@@ -119,7 +125,7 @@ class TestKilled:
         goes_on(run_dir)
 
     @pytest.mark.parametrize("save", [1, 4])
-    def test_with_half_a_checkpoint_written(self, save, faulty, goes_on):
+    def test_a_run_killed_with_half_a_checkpoint_goes_on(self, save, faulty, goes_on):
         """Each saving writes two files, ``step=...`` and ``last``."""
         run_dir, status, seen = faulty(At("torch.save", partial(limit_files, 100_000), save))
         assert status == -signal.SIGXFSZ, seen
@@ -129,7 +135,7 @@ class TestKilled:
             assert step_of(last(run_dir)) == 2
         goes_on(run_dir)
 
-    def test_worker(self, faulty, goes_on):
+    def test_a_run_whose_loader_process_was_killed_goes_on(self, faulty, goes_on):
         more = ["--data.init_args.num_workers=1"]
         run_dir, status, seen = faulty(At(STEP, kill_worker, call=6), more=more)
         assert status == 1
@@ -139,7 +145,9 @@ class TestKilled:
 
 @pytest.mark.slow
 class TestDisk:
-    def test_full_while_a_checkpoint_is_written(self, scans_folder, small_disk, ended, goes_on):
+    def test_a_full_disk_leaves_the_checkpoint_before(
+        self, scans_folder, small_disk, ended, goes_on
+    ):
         """The disk of the run, which is not that of temporary files."""
         disk = small_disk(64_000_000)
         run_dir = disk / "run"
@@ -153,7 +161,7 @@ class TestDisk:
         (disk / "filler").unlink()
         goes_on(run_dir)
 
-    def test_read_only(self, scans_folder, small_disk, make_read_only, ended):
+    def test_a_read_only_run_dir_is_refused(self, scans_folder, small_disk, make_read_only, ended):
         disk = small_disk(1_000_000)
         make_read_only(disk)
         status, seen = ended(fit_words(scans_folder, disk / "run"))
@@ -162,7 +170,7 @@ class TestDisk:
 
 
 @pytest.mark.slow
-def test_a_second_run_is_refused(scans_folder, tmp_path, start, ended, undisturbed):
+def test_a_second_fit_into_one_folder_is_refused(scans_folder, tmp_path, start, ended, undisturbed):
     run_dir = tmp_path / "run"
     first = start(fit_words(scans_folder, run_dir), At(STEP, partial(pause, tmp_path), call=2))
     first.wait_for((tmp_path / "reached").exists)
@@ -177,7 +185,9 @@ def test_a_second_run_is_refused(scans_folder, tmp_path, start, ended, undisturb
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("kept", "says"), [(None, "No such file"), (90, "not a multiple")])
-def test_scans_lost_between_index_and_read(kept, says, own_scans, tmp_path, ended, goes_on):
+def test_scans_lost_between_index_and_read_end_the_run(
+    kept, says, own_scans, tmp_path, ended, goes_on
+):
     """All of them are, in the step after a checkpoint; then they are back."""
     saved = tmp_path / "saved"
     shutil.copytree(own_scans, saved)
@@ -190,3 +200,28 @@ def test_scans_lost_between_index_and_read(kept, says, own_scans, tmp_path, ende
     assert_whole(tmp_path / "run")
     shutil.copytree(saved, own_scans, dirs_exist_ok=True)
     goes_on(tmp_path / "run", scans=own_scans)
+
+
+READERS = {
+    **{
+        f"fit {key}": lambda ckpt, out, scans, key=key: fit_words(scans, out, key, ckpt)
+        for key in ("--ckpt_path", "--model.init_args.init_from")
+    },
+    "test": lambda ckpt, out, scans: ["test", *fit_words(scans, out, "--ckpt_path", ckpt)[1:]],
+    "sample": lambda ckpt, out, scans: ["sample", "--ckpt", ckpt, "--out", out],
+    "convert": lambda ckpt, out, scans: ["convert", ckpt, out.with_suffix(".safetensors")],
+}
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_a_checkpoint_cut_short_is_refused_before_anything_is_written(
+    reader, scans_folder, tmp_path
+):
+    ckpt = tmp_path / "last.ckpt"
+    torch.save({"state_dict": {"weight": torch.zeros(1000)}}, ckpt)
+    words = READERS[reader](ckpt, tmp_path / "out", scans_folder)
+    for kept in (ckpt.stat().st_size - 1, 0):
+        os.truncate(ckpt, kept)
+        with pytest.raises(ValueError, match=f"cannot read {ckpt}: .*damaged"):
+            main([str(word) for word in words])
+    assert not [path for path in tmp_path.rglob("*") if path.is_file() and path != ckpt]

@@ -1,7 +1,8 @@
 """Two roads to one scan: weather on a recorded clear scan, and weather simulated in its scene.
 
-``python tests/lidarsim/two_roads.py notebooks/results/weather_two_roads.json 200`` writes the study
-that notebook 06 shows.
+    python tests/bench/weather_on_two_roads.py notebooks/results/weather_two_roads.json 200
+
+Writes the study that notebook 07 shows.
 """
 
 import copy

@@ -15,7 +15,7 @@ from cluster import PYTHON, Node, child_of, finish, two_nodes
 
 from r3dpa.cli import main
 
-pytestmark = [pytest.mark.slow, pytest.mark.ddp]
+pytestmark = [pytest.mark.slow, pytest.mark.ddp, pytest.mark.nodes]
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 LAUNCH = CONF / "launch"

@@ -13,11 +13,9 @@ import pytest
 from fault_commands import At, Command, assert_whole, fill, kill_worker, limit_files, pause, rows_of
 from tiny_networks import tiny_checkpoint
 
-from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
-
+pytestmark = pytest.mark.faults
 # When and where something was made, and what fills the disk.
 _NOT_PROMISED = {"metadata.json", "filler"}
-GEOMETRY = ScanGeometry(SphericalProjection(LidarSensor(16, 64)), RangeCodec(), (2, 8))
 SENSOR = {"class_path": "r3dpa.geometry.LidarSensor", "init_args": {"beams": 16, "columns": 64}}
 
 
@@ -44,7 +42,7 @@ def jobs(scans_folder, tmp_path_factory):
     (folder / "data.yaml").write_text(json.dumps({"data": data}))
     extractor = ["--extractor", "geometric", "--trainer.accelerator", "cpu"]
     sampler = ["--steps", 2, "--pictures", 0, "--device", "cpu", "--formats", "bin,ply,npz"]
-    ckpt = tiny_checkpoint(folder / "tiny.safetensors", GEOMETRY)
+    ckpt = tiny_checkpoint(folder / "tiny.safetensors")
     return {
         "simulate": Job(
             ["simulate", "--scans", 6, "--sensor", lasers],
@@ -128,7 +126,7 @@ each_job = pytest.mark.parametrize("name", ["simulate", "features", "sample", "r
 
 
 @each_job
-def test_sigterm(name, jobs, ended, out_of, goes_on):
+def test_a_command_stopped_by_sigterm_goes_on(name, jobs, ended, out_of, goes_on):
     out = out_of(name)
     stop = at(jobs[name], partial(signal.raise_signal, signal.SIGTERM))
     status, seen = ended(jobs[name].command(out), stop)
@@ -142,7 +140,9 @@ def test_sigterm(name, jobs, ended, out_of, goes_on):
 @pytest.mark.slow
 @each_job
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGXFSZ])
-def test_killed_between_two_writes_or_in_one(number, name, jobs, ended, out_of, goes_on):
+def test_a_command_killed_between_two_writes_or_in_one_goes_on(
+    number, name, jobs, ended, out_of, goes_on
+):
     out, job = out_of(name), jobs[name]
     fault = partial(limit_files, job.num_bytes)
     if number == signal.SIGKILL:
@@ -156,7 +156,9 @@ def test_killed_between_two_writes_or_in_one(number, name, jobs, ended, out_of, 
 
 @pytest.mark.slow
 @each_job
-def test_full_disk(name, jobs, ended, out_of, small_disk, goes_on):
+def test_a_command_on_a_full_disk_goes_on_when_there_is_space(
+    name, jobs, ended, out_of, small_disk, goes_on
+):
     disk = small_disk(32_000_000)
     out, job = out_of(name, disk), jobs[name]
     status, seen = ended(job.command(out), at(job, partial(fill, disk, 0)))
@@ -171,7 +173,9 @@ def test_full_disk(name, jobs, ended, out_of, small_disk, goes_on):
 
 @pytest.mark.slow
 @each_job
-def test_read_only(name, jobs, ended, out_of, small_disk, make_read_only):
+def test_a_read_only_disk_is_named_in_one_line(
+    name, jobs, ended, out_of, small_disk, make_read_only
+):
     disk = small_disk(1_000_000)
     make_read_only(disk)
     out = out_of(name, disk)
@@ -199,7 +203,7 @@ def test_a_second_command_is_refused(name, jobs, start, ended, out_of, tmp_path,
 
 
 @pytest.mark.slow  # torch notices after five seconds
-def test_loader_of_an_extraction(jobs, ended, out_of, goes_on):
+def test_an_extraction_whose_loader_process_was_killed_goes_on(jobs, ended, out_of, goes_on):
     out, job = out_of("features"), jobs["features"]
     words = job.command(out, "--data.init_args.num_workers", 1)
     status, seen = ended(words, at(job, kill_worker))

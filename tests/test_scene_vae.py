@@ -1,0 +1,80 @@
+"""From points to latents and back by the VAE of a checkpoint; wrong points and latents."""
+
+import numpy as np
+import pytest
+import torch
+from tiny_labelled import labelled_checkpoint
+from tiny_networks import GEOMETRY, tiny_checkpoint
+
+from r3dpa import SceneVAE
+from r3dpa.geometry import (
+    range_image,
+)
+
+
+@pytest.fixture(scope="module")
+def vae(tmp_path_factory):
+    path = tiny_checkpoint(tmp_path_factory.mktemp("vae") / "tiny.safetensors")
+    return SceneVAE.from_checkpoint(path, "cpu")
+
+
+@pytest.fixture
+def points():
+    return np.random.default_rng(0).uniform(-20, 20, (100, 4)).astype(np.float32)
+
+
+def test_points_that_are_no_scan_in_metres(vae, points):
+    nan = points.copy()
+    nan[3, 1] = np.nan
+    for wrong, message in (
+        ("scan.bin", "got str; r3dpa.data.read_scan reads them from a file"),
+        (nan, "points must be finite"),
+        (points[:0], "none of 0 points lies 1 to"),
+        (points * 1000, "none of 100 points .*; coordinates must be in metres"),
+        (points[:, :2], r"must be \(P, 3\) or \(P, 4\), got shape \(100, 2\)"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            vae.encode(wrong)
+
+
+def test_latents_of_numpy_are_taken_and_of_another_shape_refused(vae, points):
+    latents = vae.encode(points)
+    decoded = [vae.decode(given).range_m for given in (latents, latents.numpy())]
+    assert torch.equal(*decoded)
+    with pytest.raises(ValueError, match=r"latents must have shape \(B, \*\(4, 4, 16\)\), got"):
+        vae.decode(latents[:, :3])
+
+
+def test_a_scan_becomes_the_posterior_mean_and_points_on_the_rays(vae):
+    """From points to the posterior mean, and back to points on the rays of the pixels."""
+    points = 10 * torch.nn.functional.normalize(
+        torch.randn(500, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([1, 1, 0.1])
+    )
+    latents = vae.encode(torch.cat([points, torch.ones(500, 1)], dim=1).numpy())
+    image = GEOMETRY.codec.encode(range_image(points, GEOMETRY.projection)[0])
+    assert torch.equal(latents, vae.vae.encode(image[None, None]).mean)
+    scene = vae.decode(latents)
+    assert scene.range_m.shape == (1, 16, 64)
+    assert len(scene.points(0)) == (scene.range_m > 0).sum()
+
+
+def test_a_vae_says_what_it_is_and_moves(vae, tmp_path):
+    assert repr(vae) == "SceneVAE(16 x 64 pixels, latents 4 x 4 x 16, cpu)"
+    path = tiny_checkpoint(tmp_path / "tiny.safetensors")
+    assert SceneVAE.from_checkpoint(path, "cpu").to("meta").device.type == "meta"
+
+
+def test_a_scan_and_its_labels_become_latents_and_a_labelled_scene(tmp_path):
+    vae = SceneVAE.from_checkpoint(labelled_checkpoint(tmp_path), device="cpu")
+    torch.nn.init.normal_(vae.vae.encoder.further_in.weight)  # as a training makes it
+    generator = torch.Generator().manual_seed(0)
+    points = torch.cat([torch.randn(500, 3) * 10, torch.rand(500, 1, generator=generator)], dim=1)
+    labels = torch.full((500,), 26)
+    latents = vae.encode(points, labels)
+    assert not torch.equal(latents, vae.encode(points, labels + 1))  # trucks, not cars
+    assert torch.equal(latents, vae.encode(points.numpy(), (labels | 5 << 16).numpy()))
+    scenes = vae.decode(latents)
+    assert torch.equal(scenes.labels > 0, scenes.range_m > 0)
+    assert scenes.intensity.shape == (1, 16, 64)
+    with pytest.raises(ValueError, match="needs scans with an intensity"):
+        vae.encode(points[:, :3], labels)
