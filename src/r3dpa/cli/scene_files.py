@@ -61,7 +61,7 @@ def provenance(
 def generate_all(
     generator: SceneGenerator | BaselineGenerator, writer: SceneWriter, batch_size: int, seed: int
 ) -> dict[str, Any]:
-    """Generates and writes the missing scenes; returns evaluations and time."""
+    """Generate and write the missing scenes; return evaluations and time."""
     first_index, start = writer.num_done, time.perf_counter()
     with tqdm(
         total=writer.num, initial=first_index, unit="scene", desc="sampling", disable=None

@@ -115,7 +115,7 @@ class FewStep(FlowMatching):
         return replace(before, networks=networks)
 
     def on_fit_start(self) -> None:
-        """Loads the flow, and computes the trajectories that are not there yet."""
+        """Load the flow, and compute the missing trajectories."""
         super().on_fit_start()
         trainer = cast(Any, self.trainer)
         if trainer.fast_dev_run:
@@ -238,7 +238,7 @@ class FewStep(FlowMatching):
 
 
 def _check_thin_decoder(thin_decoder: ThinDecoder, vae: VAE) -> None:
-    """Refuses a thin decoder of other latents or images than the VAE has."""
+    """Refuse a thin decoder of other latents or images than the VAE has."""
     names = ("in_channels", "latent_channels", "stride", "modes", "least_scale")
     for name in (*names, "intensity", "num_classes"):
         expected, given = getattr(vae, name), getattr(thin_decoder, name)

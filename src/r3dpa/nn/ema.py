@@ -80,16 +80,16 @@ class EMA(nn.Module):
         self.latent_norm = copy.deepcopy(latent_norm).float().eval().requires_grad_(False)
 
     def update(self, sit: VelocityNetwork, latent_norm: LatentNorm) -> None:
-        """Moves the averages one step towards the current weights."""
+        """Move the averages one step towards the current weights."""
         update_average(self.sit, sit, self.decay, self.buffers_by)
         update_average(self.latent_norm, latent_norm, self.decay, self.buffers_by)
 
     @torch.no_grad()
     def reset(self, sit: VelocityNetwork, latent_norm: LatentNorm) -> None:
-        """Sets the averages to the current weights, as at the start of a training stage."""
+        """Set the averages to the current weights, as at the start of a training stage."""
         self.sit.load_state_dict(sit.state_dict())
         self.latent_norm.load_state_dict(latent_norm.state_dict())
 
     def train(self, mode: bool = True) -> EMA:
-        """Stays in evaluation mode."""
+        """Stay in evaluation mode."""
         return super().train(False)
