@@ -23,11 +23,10 @@ def update_average(
     Parameters follow ``average = decay * average + (1 - decay) * weight``, in the precision of the
     average. Buffers are copied; with ``buffers="decay"`` floating-point ones are averaged too.
     """
-    averages = [*average.parameters()]
-    pairs = zip(averages, network.parameters(), strict=True)
+    pairs = zip(average.parameters(), network.parameters(), strict=True)
     weights = [weight.to(mean.dtype) for mean, weight in pairs]
     if weights:
-        torch._foreach_lerp_(averages, weights, 1.0 - decay)
+        torch._foreach_lerp_([*average.parameters()], weights, 1.0 - decay)
     for target, source in zip(average.buffers(), network.buffers(), strict=True):
         if buffers == "decay" and source.is_floating_point():
             target.lerp_(source.to(target.dtype), 1.0 - decay)
