@@ -49,12 +49,11 @@ ALLOWED = {
     "viz": METHOD | {"metrics"},
     "baselines": METHOD,
     "stages": {"flow", "checkpoints", "generation", "baselines"},
-    "callbacks": METHOD | {"metrics", "viz", "baselines"},
-    "ablation": METHOD | {"metrics", "viz", "callbacks", "baselines"},
-    "bench": METHOD | {"metrics", "viz", "callbacks", "baselines", "stages"},
+    "callbacks": METHOD | {"metrics", "viz"},
+    "ablation": METHOD | {"metrics", "viz", "callbacks"},
+    "bench": METHOD | {"metrics", "viz", "callbacks", "stages"},
     "__main__": {"cli"},
-    "cli": METHOD
-    | {"metrics", "viz", "callbacks", "baselines", "stages", "bench", "ablation", "class_paths"},
+    "cli": METHOD | {"metrics", "viz", "callbacks", "stages", "bench", "ablation", "class_paths"},
 }
 ANYWHERE = {"io", "__version__"}
 
