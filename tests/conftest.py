@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import json
+import logging
 import os
 import subprocess
 from pathlib import Path
@@ -15,6 +16,8 @@ from torch import nn
 from r3dpa.cli import main
 from r3dpa.io import only_writer
 
+# Lightning keeps its messages from caplog where it is imported before there is any handler.
+logging.getLogger().addHandler(logging.NullHandler())
 gc.disable()  # a tenth of the time of collecting is spent on modules that all stay
 
 

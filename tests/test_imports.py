@@ -49,12 +49,11 @@ ALLOWED = {
     "viz": METHOD | {"metrics"},
     "baselines": METHOD,
     "stages": {"flow", "checkpoints", "generation", "baselines"},
-    "callbacks": METHOD | {"metrics", "viz", "baselines"},
-    "ablation": METHOD | {"metrics", "viz", "callbacks", "baselines"},
-    "bench": METHOD | {"metrics", "viz", "callbacks", "baselines", "stages"},
+    "callbacks": METHOD | {"metrics", "viz"},
+    "ablation": METHOD | {"metrics", "viz", "callbacks"},
+    "bench": METHOD | {"metrics", "viz", "callbacks", "stages"},
     "__main__": {"cli"},
-    "cli": METHOD
-    | {"metrics", "viz", "callbacks", "baselines", "stages", "bench", "ablation", "class_paths"},
+    "cli": METHOD | {"metrics", "viz", "callbacks", "stages", "bench", "ablation", "class_paths"},
 }
 ANYWHERE = {"io", "__version__"}
 
@@ -167,3 +166,13 @@ print(seconds, *loaded & {{"torch", "r3dpa", "lightning", "yaml", "tqdm", "filel
     seconds = [float(run.stdout.split()[0]) for run in runs]
     assert [run.stdout.split()[1:] for run in runs] == [[], []]
     assert min(seconds) < 0.3
+
+
+def test_sampling_loads_neither_lightning_nor_baselines():
+    code = """
+import sys
+import r3dpa.cli.sample, r3dpa.cli.scene_files, r3dpa.stages, r3dpa.viz.scenes
+print(*{"lightning", "r3dpa.baselines", "r3dpa.modules"} & set(sys.modules))
+"""
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.split() == []

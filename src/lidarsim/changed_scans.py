@@ -12,9 +12,10 @@ from lidarsim.io import atomic_path
 
 
 def write_below(cloud: PointCloud, root: Path, out: Path) -> dict[str, int]:
-    """Write a cloud, its labels first, to the place below ``out`` that its file has below ``root``.
+    """Write a cloud and its labels below ``out``, where its file has its place below ``root``.
 
-    Labels from outside ``root`` are written beside the scan.
+    Labels come first: where the scan is, it is complete. Labels from outside ``root`` are written
+    beside the scan.
 
     Returns:
         Size of each written file by its name below ``out``.
@@ -26,9 +27,9 @@ def write_below(cloud: PointCloud, root: Path, out: Path) -> dict[str, int]:
     path = out / cloud.file.path.relative_to(root)
     contents: dict[Path, bytes] = {}
     if cloud.labels is not None and cloud.file.label_path is not None:
-        place = Path(os.path.relpath(cloud.file.label_path, root))
-        beside = place.parts[0] == ".."
-        label_path = path.with_name(place.name) if beside else out / place
+        name = Path(os.path.relpath(cloud.file.label_path, root))
+        is_outside = name.parts[0] == ".."
+        label_path = path.with_name(name.name) if is_outside else out / name
         contents[label_path] = cloud.labels.astype("<u4").tobytes()
     contents[path] = packed(path, cloud)
     for written, content in contents.items():
@@ -45,16 +46,18 @@ def refuse_outside(path: Path, out: Path) -> None:
         ScanError: With the name of the file.
     """
     if not path.parent.resolve().is_relative_to(out.resolve()):
-        raise ScanError(f"{path}: leads out of {out}: give another --out")
+        raise ScanError(f"{path}: a link leads out of {out}; give another --out")
 
 
 def inputs_of(path: Path, root: Path) -> dict[str, list[int]]:
     """Size and time of change in ns of a scan and its labels, by their names from ``root``."""
-    stats = {file: file.stat() for file in (path, label_path_of(path)) if file and file.is_file()}
-    return {
-        Path(os.path.relpath(file, root)).as_posix(): [about.st_size, about.st_mtime_ns]
-        for file, about in stats.items()
-    }
+    inputs = {}
+    for file in (path, label_path_of(path)):
+        if file is not None and file.is_file():
+            status = file.stat()
+            name = Path(os.path.relpath(file, root)).as_posix()
+            inputs[name] = [status.st_size, status.st_mtime_ns]
+    return inputs
 
 
 def refuse_shared_labels(paths: Iterable[Path]) -> None:

@@ -141,7 +141,7 @@ class SceneGenerator:
         batch_size: int | None = None,
         compile: bool = False,
     ) -> Self:
-        """Rebuilds the networks of a checkpoint, on the path and geometry they were trained with.
+        """Rebuild the networks of a checkpoint, on the path and geometry they were trained with.
 
         Args:
             checkpoint: File of stage joint or flow_matching in any layout, or its content; name of
@@ -237,7 +237,7 @@ class SceneGenerator:
         )
 
     def to(self, device: str | torch.device) -> Self:
-        """Moves the networks, and returns the generator itself."""
+        """Move the networks, and return the generator itself."""
         if self.compiled:
             raise ValueError(
                 "compiled networks cannot move: build the generator on the other device"
@@ -265,7 +265,7 @@ class SceneGenerator:
 
     @torch.inference_mode()
     def prepare(self) -> None:
-        """Precomputes the modulations of all times of the solver, which the first scene needs.
+        """Precompute the modulations of all times of the solver, which the first scene needs.
 
         Raises:
             ValueError: If the times of the sampler are out of range.
@@ -293,7 +293,7 @@ class SceneGenerator:
     def generate(
         self, indices: int | Sequence[int], seed: int = 0, *, progress: bool = False
     ) -> SceneBatch:
-        """Draws one scene per index, asynchronously on a GPU.
+        """Draw one scene per index, asynchronously on a GPU.
 
         Args:
             indices: Numbers of the scenes, or how many: 4 for ``range(4)``; at most ``batch_size``.
@@ -367,7 +367,7 @@ class SceneGenerator:
         return next(scene_noise(self.latent_shape, indices, seed)).to(self.device)
 
     def _use_channels_last_on_gpu(self) -> None:
-        """Gives a copy of the decoder the layout that half-precision kernels of a GPU expect."""
+        """Give a copy of the decoder the layout that half-precision kernels of a GPU expect."""
         if self.device.type == "cuda":
             self.vae = copy.deepcopy(self.vae)
             self.vae.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -393,7 +393,7 @@ def geometry_of(checkpoint: Checkpoint) -> ScanGeometry:
 
 
 def check_precision(precision: str) -> None:
-    """Refuses a precision that no generator has."""
+    """Refuse a precision that no generator has."""
     if precision not in ("fp32", "bf16"):
         raise ValueError(f"unknown precision {precision!r}; choose from fp32, bf16")
 

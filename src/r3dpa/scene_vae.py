@@ -48,13 +48,13 @@ class SceneVAE:
         return next(self.vae.parameters()).device
 
     def to(self, device: str | torch.device) -> Self:
-        """Moves the VAE, and returns the object itself."""
+        """Move the VAE, and return the object itself."""
         self.vae.to(usable_device(str(device)))
         return self
 
     @classmethod
     def from_checkpoint(cls, checkpoint: str | Path | Checkpoint, device: str = "auto") -> Self:
-        """Rebuilds the VAE of a checkpoint.
+        """Rebuild the VAE of a checkpoint.
 
         Raises:
             FileNotFoundError: If there is no such file.

@@ -79,7 +79,7 @@ class ScheduledVelocity:
         return self.num_times * (2 if guided else 1)
 
     def schedule(self, times: Tensor, target: Tensor | None = None) -> None:
-        """Precomputes the modulations of times ``(T,)``, with targets of average velocities."""
+        """Precompute the modulations of times ``(T,)``, with targets of average velocities."""
         self.num_times, self._averages = len(times), target is not None
         if target is not None:
             self._table = cast(AverageVelocitySiT, self.sit).average_modulations(times, target)
@@ -87,7 +87,7 @@ class ScheduledVelocity:
             self._table = self.sit.modulations(times) if self.num_times else None
 
     def restart(self) -> None:
-        """Starts from the first time again."""
+        """Start from the first time again."""
         self._rows = iter(() if self._table is None else self._table.split(1))
 
     def __call__(self, latents: Tensor, time: Tensor, target: Tensor | None = None) -> Tensor:

@@ -4,6 +4,8 @@ Networks and images are tiny here; the slow tests start them at their own sizes.
 """
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -233,6 +235,22 @@ def test_the_second_edition_of_r3dpa_s_starts(name, start, tmp_path):
     settings |= start_flow(tmp_path, vae, (16, 64), sit, codec)
     files = ("trainer", "data", *R3DPA_S_2[name])
     start(["trainer", *(f"r3dpa_s_2/{part}" for part in files)], settings)
+
+
+def test_few_steps_keep_the_arguments_of_the_sit_of_the_flow(tmp_path):
+    """In a process of its own, as users run it: others parsed before it hid that they were lost."""
+    overlay = tmp_path / "few_step.yaml"
+    sit = {"class_path": "r3dpa.nn.AverageVelocitySiT", "init_args": {"average_blocks": 3}}
+    model = {"class_path": "r3dpa.modules.FewStep", "init_args": {"sit": sit}}
+    overlay.write_text(yaml.safe_dump({"model": model}))
+    names = ("trainer", "r3dpa_s/data", "r3dpa_s/flow_matching")
+    configs = [f"--config={path}" for path in (*(CONF / f"{n}.yaml" for n in names), overlay)]
+    command = [sys.executable, "-m", "r3dpa", "fit", *configs, "--print_config"]
+    printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    network = yaml.safe_load(printed)["model"]["init_args"]["sit"]
+    expected = yaml.safe_load((CONF / "r3dpa_s/sit.yaml").read_text())["init_args"]
+    assert network["class_path"] == sit["class_path"]
+    assert {name: network["init_args"][name] for name in expected} == expected
 
 
 def test_feature_grids_have_the_tokens_of_the_sit_and_come_from_shipped_weights():

@@ -18,7 +18,7 @@ import pytest
 
 from r3dpa.cli import COMMANDS, OWN_PARSER, _find, main
 from r3dpa.cli.features import features_parser, with_data_class
-from r3dpa.cli.parser import load, parse
+from r3dpa.cli.parser import load, make_parser, parse
 
 TOP = Path(__file__).resolve().parents[2]
 CONF = TOP / "conf"
@@ -153,6 +153,18 @@ def test_a_span_without_options_names_a_command():
             words = span.split()[1:]
             if words[0] not in {"COMMAND", "--help"} and words not in [[group] for group in groups]:
                 _find(words)
+
+
+def test_abridged_spans_have_options_of_their_commands():
+    """``...`` stands for further options and ``a|b`` for a choice; such a span is not run."""
+    spans = [span for text in documents().values() for span in spans_of(text, "r3dpa")]
+    abridged = [span for span in spans if " --" in span and re.search(r"\.\.\.|\|", span)]
+    assert abridged
+    for span in abridged:
+        name, words = _find(shlex.split(span)[1:])
+        actions = make_parser(load(COMMANDS[name].target))._actions
+        options = {option for action in actions for option in action.option_strings}
+        assert {word for word in words if word.startswith("--")} <= options, span
 
 
 def test_recipes_are_read_whole():

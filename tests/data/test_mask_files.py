@@ -33,7 +33,7 @@ def test_a_picture_that_is_no_mask_is_named(tmp_path, sensor):
     with pytest.raises(ValueError, match=r"small\.png: has 4 x 32 pixels .* image 8 x 32"):
         read_mask(small, sensor)
     deep = drawn(tmp_path / "deep.png", np.zeros((8, 32), np.uint16))
-    with pytest.raises(ValueError, match=r"deep\.png: has pixels of type I;16"):
+    with pytest.raises(ValueError, match=r"deep\.png: has pixels of type I"):
         read_mask(deep, sensor)
     cut = tmp_path / "cut.png"
     cut.write_bytes(drawn(tmp_path / "a.png", np.full((8, 32), 255, np.uint8)).read_bytes()[:50])

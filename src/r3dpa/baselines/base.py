@@ -6,7 +6,6 @@ import copy
 from collections.abc import Callable, Iterator
 from typing import Any, Literal
 
-import torch
 from torch import Tensor, nn
 
 from r3dpa.baselines.diffusion_paths import repaint
@@ -18,6 +17,7 @@ from r3dpa.flow.sampler import SamplerConfig
 from r3dpa.flow.solvers import Velocity
 from r3dpa.modules.settings import OptimizerConfig, TimeSampling
 from r3dpa.modules.stage import Stage
+from r3dpa.nn.ema import update_average
 
 
 class AveragedNetwork(nn.Module):
@@ -36,18 +36,11 @@ class AveragedNetwork(nn.Module):
         self.network = copy.deepcopy(network).eval().requires_grad_(False)
         self.decay = decay
 
-    @torch.no_grad()
     def update(self, network: nn.Module, step: int) -> None:
         """Move the average towards the weights after ``step``."""
-        if (decay := self.decay(step)) == 1:
-            return
-        ours = [*self.network.parameters(), *self.network.buffers()]
-        theirs = [*network.parameters(), *network.buffers()]
-        for average, weight in zip(ours, theirs, strict=True):
-            if decay == 0 or not average.is_floating_point():
-                average.copy_(weight)
-            else:
-                average.lerp_(weight.to(average.dtype), 1 - decay)
+        decay = self.decay(step)
+        if decay < 1:
+            update_average(self.network, network, decay, buffers="decay")
 
     def train(self, mode: bool = True) -> AveragedNetwork:
         """Stay in evaluation mode."""

@@ -8,18 +8,20 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
-from r3dpa.baselines import BaselineGenerator
 from r3dpa.bench.measure import flop_of, timed
 from r3dpa.checkpoints import Checkpoint
 from r3dpa.flow.solvers import ODE_SOLVERS, heun
 from r3dpa.flow.times import ode_times
 from r3dpa.generation import SamplerConfig, SceneGenerator
 from r3dpa.stages import scene_generator
+
+if TYPE_CHECKING:
+    from r3dpa.baselines import BaselineGenerator
 
 Precision = Literal["fp32", "bf16"]
 Decoder = Literal["full", "thin"]

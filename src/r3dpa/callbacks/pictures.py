@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import lightning as L
 import torch
@@ -13,12 +13,14 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from r3dpa import viz
-from r3dpa.baselines import Baseline
 from r3dpa.data import write_bin
 from r3dpa.generation import SamplerConfig
 from r3dpa.geometry import points_of
 from r3dpa.io import first_line
 from r3dpa.modules import GenerativeModule
+
+if TYPE_CHECKING:
+    from r3dpa.baselines import Baseline
 
 
 class ReconstructionWriter(L.Callback):

@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import lightning as L
 from jsonargparse.typing import NonNegativeInt, PositiveInt
@@ -15,7 +15,6 @@ from lightning.pytorch.utilities import rank_zero_info
 from safetensors.torch import load_file, save_file
 from tqdm import tqdm
 
-from r3dpa.baselines import Baseline
 from r3dpa.data import Scan
 from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.generation import SamplerConfig
@@ -34,8 +33,11 @@ from r3dpa.metrics.reference import ReferenceStatistics, cards_of, compute_refer
 from r3dpa.metrics.results import report, save_reports
 from r3dpa.metrics.scene import PROTOCOLS, EvaluationScene
 from r3dpa.metrics.scene_features import FREE_SPACES, SceneFeatures
-from r3dpa.modules import GenerativeModule
 from r3dpa.viz.evaluation import save_figures
+
+if TYPE_CHECKING:
+    from r3dpa.baselines import Baseline
+    from r3dpa.modules import GenerativeModule
 
 _SAMPLER = SamplerConfig()
 
@@ -89,10 +91,10 @@ class SceneScorer(L.Callback):
         self.allow_few, self.skip_bad = allow_few, skip_bad
         self._job: tuple[AnyReference, list[SceneFeatures], list[Scan]] | None = None
 
-    def on_test_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+    def on_test_start(self, trainer: L.Trainer, pl_module: Any) -> None:
         """Check all that can be checked before scenes are sampled."""
         self._job = None
-        if not isinstance(pl_module, GenerativeModule | Baseline) or not self.num_scenes:
+        if not hasattr(pl_module, "scene_generator") or not self.num_scenes:
             return
         if pl_module.ema is None:
             rank_zero_info(f"stage {pl_module.stage} has nothing to sample: no scenes are scored")
@@ -126,9 +128,9 @@ class SceneScorer(L.Callback):
         check_counts(self.num_scenes, statistics, spaces, self.allow_few)
         self._job = (statistics, spaces, scans)
 
-    def on_test_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+    def on_test_end(self, trainer: L.Trainer, pl_module: Any) -> None:
         """Sample scenes and compare them with real scans."""
-        if self._job is None or not isinstance(pl_module, GenerativeModule | Baseline):
+        if self._job is None:
             return
         statistics, spaces, scans = self._job
         self._job = None

@@ -105,9 +105,9 @@ class Parser(ArgumentParser):
             words.append(f"{name}{equals}{current_path(value)}")
         return super().parse_args(words, *others, **settings)
 
-    def format_help(self, formatter: Any = None) -> str:
+    def format_help(self, *formatter: Any) -> str:  # which jsonargparse 4.53 gives
         """Help of the options, and of the fields of each optional dataclass."""
-        texts = [super().format_help(formatter)]
+        texts = [super().format_help(*formatter)]
         for action in self._actions:
             kinds = [k for k in get_args(getattr(action, "_typehint", None)) if k is not type(None)]
             if len(kinds) == 1 and is_dataclass(kinds[0]) and not action.dest.endswith(".help"):

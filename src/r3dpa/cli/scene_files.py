@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from tqdm import tqdm
@@ -15,7 +15,6 @@ from tqdm import tqdm
 import r3dpa
 from lidarsim.scan_files import read_beside, read_clouds
 from r3dpa import viz
-from r3dpa.baselines import BaselineGenerator
 from r3dpa.checkpoints import Checkpoint
 from r3dpa.cli.parser import SceneOptions
 from r3dpa.data.scans import find_scans
@@ -24,6 +23,9 @@ from r3dpa.generation import SceneGenerator
 from r3dpa.geometry import ScanGeometry
 from r3dpa.io import source_commit
 from r3dpa.pretrained import without_features
+
+if TYPE_CHECKING:
+    from r3dpa.baselines import BaselineGenerator
 
 
 def written(path: Path) -> str:
@@ -61,7 +63,7 @@ def provenance(
 def generate_all(
     generator: SceneGenerator | BaselineGenerator, writer: SceneWriter, batch_size: int, seed: int
 ) -> dict[str, Any]:
-    """Generates and writes the missing scenes; returns evaluations and time."""
+    """Generate and write the missing scenes; return evaluations and time."""
     first_index, start = writer.num_done, time.perf_counter()
     with tqdm(
         total=writer.num, initial=first_index, unit="scene", desc="sampling", disable=None

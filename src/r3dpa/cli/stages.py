@@ -265,7 +265,7 @@ class StageCLI(LightningCLI):
             raise ValueError(f"{self.subcommand} needs trained weights: give --ckpt_path")
 
     def before_validate(self) -> None:
-        """Refuses to use random weights, and logs at the step of the checkpoint, not at 0."""
+        """Refuse random weights, and log at the step of the checkpoint, not at 0."""
         self.before_predict()
         self.trainer.fit_loop.epoch_loop._batches_that_stepped = self._ckpt_step or 0
 

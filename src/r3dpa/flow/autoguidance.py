@@ -83,7 +83,7 @@ def autoguided(
 
 
 def check_scale(scale: float) -> None:
-    """Refuses a strength of guidance below 1 or not finite."""
+    """Refuse a strength of guidance below 1 or not finite."""
     if not (math.isfinite(scale) and scale >= 1):
         raise ValueError(
             f"the scale of guidance must be a number of 1 or more, got {scale}; 1 is no "

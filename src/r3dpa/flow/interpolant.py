@@ -29,7 +29,7 @@ class PathCoefficients(NamedTuple):
     d_sigma: Tensor
 
     def data_and_noise(self, x: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor]:
-        """Recovers data and noise from a state and its velocity."""
+        """Recover data and noise from a state and its velocity."""
         determinant = self.alpha * self.d_sigma - self.sigma * self.d_alpha
         data = (self.d_sigma * x - self.sigma * velocity) / determinant
         return data, (self.alpha * velocity - self.d_alpha * x) / determinant

@@ -70,7 +70,7 @@ def per_sample(values: Tensor, x: Tensor) -> Tensor:
 
 
 def check_interval(interval: tuple[float, float], name: str) -> None:
-    """Refuses an interval that is not two increasing times in [0, 1]."""
+    """Refuse an interval that is not two increasing times in [0, 1]."""
     if not 0 <= interval[0] < interval[1] <= 1:
         raise ValueError(
             f"{name} must be two times 0 <= first < last <= 1 (0 data, 1 noise), "

@@ -119,7 +119,7 @@ class GenerativeModule(Stage):
     # Starting a stage
 
     def configure_model(self) -> None:
-        """Arranges the memory of the networks, and compiles them for a fit."""
+        """Arrange the memory of the networks, and compile them for a fit."""
         format_ = torch.channels_last if self.channels_last else torch.contiguous_format
         for network in (self.vae, self.discriminator):
             if network is not None:
@@ -132,7 +132,7 @@ class GenerativeModule(Stage):
                     part.compile(dynamic=False)
 
     def setup(self, stage: str) -> None:
-        """Checks trainer and data against the networks.
+        """Check trainer and data against the networks.
 
         The data module may be any that gives :class:`r3dpa.data.LidarBatch` batches and has a
         ``geometry`` after its own setup.
@@ -152,7 +152,7 @@ class GenerativeModule(Stage):
                 self._check_features(geometry, datamodule)
 
     def _check_features(self, geometry: ScanGeometry, datamodule: object) -> None:
-        """Refuses data without feature grids, or with grids of another size than the network's."""
+        """Refuse data without feature grids, or with grids of another size than the network's."""
         if getattr(datamodule, "features_dir", "") is None:
             raise ValueError(
                 f"stage {self.stage} aligns with 3D features, but the data module has none; give "
@@ -173,7 +173,7 @@ class GenerativeModule(Stage):
             )
 
     def on_fit_start(self) -> None:
-        """Loads the stage before, unless this run goes on from a checkpoint of its own."""
+        """Load the stage before, unless this run goes on from a checkpoint of its own."""
         if not self._has_weights:
             self.load_previous_stage()
         if self._previous_geometry is not None:
@@ -181,7 +181,7 @@ class GenerativeModule(Stage):
             self._check_geometry(recorded, str(self.init_from))
 
     def load_previous_stage(self) -> None:
-        """Loads ``rgb_weights`` and ``init_from`` and restarts the EMA from the loaded weights.
+        """Load ``rgb_weights`` and ``init_from``, and restart the EMA from the loaded weights.
 
         A fit does it by itself; called earlier, it says early what does not fit.
         """
@@ -322,7 +322,7 @@ class GenerativeModule(Stage):
     # Optimisation
 
     def optimizer_step(self, *args: Any, **kwargs: Any) -> None:
-        """Steps the optimiser, then the averages, unless the step was skipped."""
+        """Step the optimiser, then the averages, unless the step was skipped."""
         super().optimizer_step(*args, **kwargs)
         if self.ema is not None and not self.step_skipped:
             self.ema.update(self.sit, self.latent_norm)
@@ -334,7 +334,7 @@ class GenerativeModule(Stage):
         return self.vae.decode(self.vae.encode(image).mean)
 
     def validation_step(self, batch: LidarBatch, batch_idx: int) -> None:
-        """Adds held-out scans to the means: the losses, and the reconstruction error in metres.
+        """Add held-out scans to the means: the losses, and the reconstruction error in metres.
 
         The error is the mean over all pixels with a return, the class accuracy over those with a
         label; the losses are means over the scans.
@@ -406,7 +406,7 @@ class GenerativeModule(Stage):
     # Checkpoints
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Writes weights in the usual order in memory, and how scenes are to be sampled."""
+        """Write weights in the usual order in memory, and how scenes are to be sampled."""
         state = checkpoint["state_dict"]
         checkpoint["state_dict"] = {name: value.contiguous() for name, value in state.items()}
         super().on_save_checkpoint(checkpoint)
@@ -416,13 +416,13 @@ class GenerativeModule(Stage):
         checkpoint["r3dpa"]["sampling"] = sampling
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuses the checkpoint of another stage or of other range images."""
+        """Refuse the checkpoint of another stage or of other range images."""
         super().on_load_checkpoint(checkpoint)
         self._has_weights = True
 
 
 def check_image(vae: VAE, codec: RangeCodec) -> None:
-    """Refuses a VAE of other images than a codec encodes."""
+    """Refuse a VAE of other images than a codec encodes."""
     of_vae = f"channels {vae.image_channels}, intensity {vae.intensity}, "
     of_vae += f"num_classes {vae.num_classes}"
     of_codec = f"channels {codec.channels}, intensity {codec.intensity_channel}, "

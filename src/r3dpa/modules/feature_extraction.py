@@ -59,7 +59,7 @@ class FeatureExtraction(LightningModule):
         self._writers: dict[tuple[int, int], StoreWriter] = {}
 
     def setup(self, stage: str) -> None:
-        """Takes scans and projection of the first process: others may lack what is needed."""
+        """Take scans and projection of the first process: others may lack what is needed."""
         given = self.projection, self.scans
         self.projection, self.scans = self.trainer.strategy.broadcast(given)
 
@@ -77,18 +77,18 @@ class FeatureExtraction(LightningModule):
     def transfer_batch_to_device(
         self, batch: list[PointSample], device: torch.device, dataloader_idx: int
     ) -> list[PointSample]:
-        """Leaves the batch where it is: the extractor moves what it needs."""
+        """Leave the batch where it is: the extractor moves what it needs."""
         return batch
 
     def on_predict_start(self) -> None:
-        """Opens a shard for each grid size; not called in a process that has nothing to do."""
+        """Open a shard for each grid size; not called in a process that has nothing to do."""
         projection = cast(Projection, self.projection)
         for size in self.grid_sizes:
             settings = GridSettings.of(self.extractor, projection, size, self.trainer.precision)
             self._writers[size] = settings.store(self.features_dir).writer(self.global_rank)
 
     def predict_step(self, batch: list[PointSample]) -> None:
-        """Pools the features of scans prepared by the extractor and writes their grids."""
+        """Pool the features of scans prepared by the extractor, and write their grids."""
         projection = cast(Projection, self.projection)
         grids = pooled_grids(self.extractor, batch, projection, self.grid_sizes)
         keys = [sample.key for sample in batch]
@@ -96,12 +96,12 @@ class FeatureExtraction(LightningModule):
             writer.add(keys, grids[size])
 
     def teardown(self, stage: str) -> None:
-        """Waits until all processes have written all of their grids."""
+        """Wait until all processes have written all of their grids."""
         self.close()
         self.trainer.strategy.barrier("feature grids")
 
     def close(self) -> None:
-        """Releases the shards, after an error too."""
+        """Release the shards, after an error too."""
         for writer in self._writers.values():
             writer.close()
         self._writers.clear()

@@ -23,7 +23,7 @@ from r3dpa.flow.times import per_sample
 from r3dpa.modules.flow_matching import FlowMatching
 from r3dpa.modules.settings import TimeSampling
 from r3dpa.modules.stage import PathDraws, zero_loss
-from r3dpa.nn import VAE, AverageVelocitySiT, ThinDecoder
+from r3dpa.nn import VAE, AverageVelocitySiT, ThinDecoder, VelocityNetwork
 from r3dpa.nn.layers import num_processes
 
 _POINTS = 8  # of a trajectory after the noise, see average_times
@@ -78,11 +78,13 @@ class FewStep(FlowMatching):
     def __init__(
         self,
         vae: VAE,
-        sit: AverageVelocitySiT,
+        sit: VelocityNetwork,
         thin_decoder: ThinDecoder | None = None,
         trajectories: int = 4096,
         **kwargs: Any,
     ) -> None:
+        # Not by the type of the argument: a YAML file with AverageVelocitySiT, given after one with
+        # SiT, would then lose the arguments of the SiT.
         if not isinstance(sit, AverageVelocitySiT):
             raise ValueError(
                 "stage few_step trains a copy of the last blocks of the SiT: set "
@@ -115,7 +117,7 @@ class FewStep(FlowMatching):
         return replace(before, networks=networks)
 
     def on_fit_start(self) -> None:
-        """Loads the flow, and computes the trajectories that are not there yet."""
+        """Load the flow, and compute the missing trajectories."""
         super().on_fit_start()
         trainer = cast(Any, self.trainer)
         if trainer.fast_dev_run:
@@ -238,7 +240,7 @@ class FewStep(FlowMatching):
 
 
 def _check_thin_decoder(thin_decoder: ThinDecoder, vae: VAE) -> None:
-    """Refuses a thin decoder of other latents or images than the VAE has."""
+    """Refuse a thin decoder of other latents or images than the VAE has."""
     names = ("in_channels", "latent_channels", "stride", "modes", "least_scale")
     for name in (*names, "intensity", "num_classes"):
         expected, given = getattr(vae, name), getattr(thin_decoder, name)

@@ -64,7 +64,7 @@ class FlowMatching(GenerativeModule):
         return self.weights.sit_alignment != 0
 
     def load_previous_stage(self) -> None:
-        """Loads the trained VAE and its latent statistics; refuses to start without them."""
+        """Load the trained VAE and its latent statistics; refuse to start without them."""
         if self.init_from is None:
             raise ValueError(
                 f"stage {self.stage} trains on the latents of a trained VAE: give "
@@ -78,7 +78,7 @@ class FlowMatching(GenerativeModule):
             )
 
     def setup(self, stage: str) -> None:
-        """Checks data against networks, and whether posteriors of the data can be cached."""
+        """Check data against networks, and whether posteriors of the data can be cached."""
         super().setup(stage)
         if not self.cache_latents or stage != "fit":
             return
@@ -91,7 +91,7 @@ class FlowMatching(GenerativeModule):
             self.augmentation.check_latents(self.sit.input_size[1], self._datamodule.grid_size[1])
 
     def on_fit_start(self) -> None:
-        """Loads the VAE, and encodes the training scans that are not encoded yet.
+        """Load the VAE, and encode the training scans that are not encoded yet.
 
         A ``fast_dev_run`` encodes its few scans in each step.
         """

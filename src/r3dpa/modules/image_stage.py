@@ -26,6 +26,6 @@ class ImageStage(Stage):
         return datamodule
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Adds the images that it was trained with."""
+        """Add the images that it was trained with."""
         super().on_save_checkpoint(checkpoint)
         checkpoint["r3dpa"]["images"] = self.images.settings

@@ -41,7 +41,7 @@ class ImageVAETraining(ImageStage):
         self.weights = weights
 
     def setup(self, stage: str) -> None:
-        """Checks trainer and data against the VAE."""
+        """Check trainer and data against the VAE."""
         check_trainer(self.trainer)
         size = self.images.image_size
         self.latent_shape = (self.vae.latent_channels, *self.vae.latent_size((size, size)))

@@ -65,7 +65,7 @@ class PointPretraining(LightningModule):
         self.grid: ScanGrid | None = None
 
     def setup(self, stage: str) -> None:
-        """Takes the preparation of the scans from the data module and checks its cells."""
+        """Take the preparation of the scans from the data module, and check its cells."""
         masking = getattr(cast(Any, self.trainer).datamodule, "prepare", None)
         if not isinstance(masking, Masking):
             raise ValueError(
@@ -146,7 +146,7 @@ class PointPretraining(LightningModule):
         return torch.optim.AdamW(groups, **self.optimizer_config.adamw())
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
-        """Sets the rate of the coming step."""
+        """Set the rate of the coming step."""
         rate = self.optimizer_config.rate(self.global_step, self.trainer.max_steps)
         for group in optimizer.param_groups:
             group["lr"] = rate

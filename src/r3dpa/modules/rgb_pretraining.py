@@ -92,7 +92,7 @@ class RGBPretraining(ImageStage):
         self._resumed = False
 
     def setup(self, stage: str) -> None:
-        """Checks trainer and data against the networks, and that a teacher has weights."""
+        """Check trainer and data against the networks, and that a teacher has weights."""
         check_trainer(self.trainer)
         size = self.images.image_size
         check_latents(self.vae, self.sit, (size, size))
@@ -104,7 +104,7 @@ class RGBPretraining(ImageStage):
             )
 
     def on_fit_start(self) -> None:
-        """Loads the VAE, encodes the images that are not encoded yet, measures their latents."""
+        """Load the VAE, encode the images that are not encoded yet, and measure their latents."""
         if not self._resumed:
             if self.init_from is None:
                 raise ValueError(
@@ -179,12 +179,12 @@ class RGBPretraining(ImageStage):
     test_step = validation_step
 
     def optimizer_step(self, *args: Any, **kwargs: Any) -> None:
-        """Steps the optimiser, then the averages, unless the step was skipped."""
+        """Step the optimiser, then the averages, unless the step was skipped."""
         super().optimizer_step(*args, **kwargs)
         if not self.step_skipped:
             self.ema.update(self.sit, self.latent_norm)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuses the checkpoint of another stage."""
+        """Refuse the checkpoint of another stage."""
         super().on_load_checkpoint(checkpoint)
         self._resumed = True

@@ -254,7 +254,7 @@ class Stage(L.LightningModule, ABC):
         return supported and self.trainer.precision != "16-mixed"
 
     def on_train_start(self) -> None:
-        """Restores a resumed optimiser to its device and to the memory format of the weights.
+        """Restore a resumed optimiser to its device and to the memory format of the weights.
 
         A fused optimiser walks through the memory of weights and moments alike, unchecked.
         """
@@ -269,7 +269,7 @@ class Stage(L.LightningModule, ABC):
                     state[name] = torch.empty_like(parameter).copy_(state[name])
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
-        """Sets the rate of the coming step, a function of its number alone."""
+        """Set the rate of the coming step, a function of its number alone."""
         config = self.optimizer_config
         rate = config.rate(self.global_step, self.trainer.max_steps)
         relative = {
@@ -285,7 +285,7 @@ class Stage(L.LightningModule, ABC):
         gradient_clip_val: int | float | None = None,
         gradient_clip_algorithm: str | None = None,
     ) -> None:
-        """Clips each network's gradient norm by itself and logs it as ``grad_norm/<network>``."""
+        """Clip each network's gradient norm by itself, and log it as ``grad_norm/<network>``."""
         algorithm = gradient_clip_algorithm
         if algorithm not in (None, "norm"):
             raise ValueError(
@@ -303,11 +303,11 @@ class Stage(L.LightningModule, ABC):
     # Held-out samples
 
     def on_validation_epoch_end(self) -> None:
-        """Logs the means over the held-out samples as ``val/<name>``."""
+        """Log the means over the held-out samples as ``val/<name>``."""
         self._log_held_out("val")
 
     def on_test_epoch_end(self) -> None:
-        """Logs the means over the held-out samples as ``test/<name>``."""
+        """Log the means over the held-out samples as ``test/<name>``."""
         self._log_held_out("test")
 
     def _log_held_out(self, split: str) -> None:
@@ -318,7 +318,7 @@ class Stage(L.LightningModule, ABC):
     # Checkpoints
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Adds stage, interpolant and version, and of scans what sampling and a resume need."""
+        """Add stage, interpolant and version, and of scans what sampling and a resume need."""
         facts: dict[str, Any] = {
             "stage": self.stage,
             "interpolant": self.interpolant.path,
@@ -332,7 +332,7 @@ class Stage(L.LightningModule, ABC):
         checkpoint["r3dpa"] = facts
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuses the checkpoint of another stage or of other range images, and keeps its step.
+        """Refuse the checkpoint of another stage or of other range images, and keep its step.
 
         Optimiser settings stay as this run has them.
         """
@@ -350,7 +350,7 @@ class Stage(L.LightningModule, ABC):
             self._check_geometry(ScanGeometry.from_dict(facts["geometry"]), "the checkpoint")
 
     def _check_geometry(self, recorded: ScanGeometry, source: str) -> None:
-        """Refuses weights that were trained on other range images than this run's."""
+        """Refuse weights that were trained on other range images than this run's."""
         if self.geometry is None:
             self.geometry = recorded
         for name in ("projection", "codec"):
@@ -380,7 +380,7 @@ class HeldOutMeans(Metric):
         self.add_state("values", [], dist_reduce_fx="cat")
 
     def update(self, index: Tensor, **sums: Tensor | tuple[Tensor, Tensor]) -> None:
-        """Adds samples by their index ``(B,)``: a value ``(B,)`` each, or its sum and weight."""
+        """Add samples by their index ``(B,)``: a value ``(B,)`` each, or its sum and weight."""
         pairs = [s if isinstance(s, tuple) else (s, torch.ones_like(s)) for s in sums.values()]
         self.names = tuple(sums)
         self.index.append(index)
@@ -407,7 +407,7 @@ def networks_as_settings() -> Iterator[None]:
 
 @contextmanager
 def frozen(*networks: nn.Module) -> Iterator[None]:
-    """Records the forward pass inside without gradients to the networks' own parameters.
+    """Record the forward pass inside without gradients to the networks' own parameters.
 
     Gradients still flow through the networks to their inputs.
     """
@@ -441,7 +441,7 @@ def gradient_norms(optimizer: torch.optim.Optimizer, device: torch.device) -> di
 
 
 def check_trainer(trainer: L.Trainer) -> None:
-    """Refuses precisions and callbacks that the stages cannot train with."""
+    """Refuse precisions and callbacks that the stages cannot train with."""
     settings = cast(Any, trainer)
     if settings.precision not in _PRECISIONS:
         raise ValueError(
@@ -461,7 +461,7 @@ def check_trainer(trainer: L.Trainer) -> None:
 
 
 def check_latents(vae: VAE | ImageVAE, sit: VelocityNetwork, image_size: tuple[int, int]) -> None:
-    """Refuses a velocity network of other latents than the images have."""
+    """Refuse a velocity network of other latents than the images have."""
     if sit.in_channels != vae.latent_channels:
         raise ValueError(
             f"the {type(sit).__name__} has in_channels {sit.in_channels}, but the VAE has "

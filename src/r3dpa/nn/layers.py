@@ -36,7 +36,7 @@ def at_least_float32(values: Tensor) -> Tensor:
 
 
 def no_autocast(device: torch.device) -> AbstractContextManager[Any]:
-    """Disables autocast; does nothing on ``meta``, which has none."""
+    """Disable autocast; do nothing on ``meta``, which has none."""
     if device.type == "meta":
         return nullcontext()
     return torch.autocast(device.type, enabled=False)

@@ -238,7 +238,7 @@ class SiT(VelocityNetwork):
         return list(self.blocks)
 
     def to_bfloat16_(self) -> Self:
-        """Casts the weights of attention and MLPs to bfloat16 in place, for sampling.
+        """Cast the weights of attention and MLPs to bfloat16 in place, for sampling.
 
         Time embedding, modulations, the token stream between the blocks, statistics of the norms
         and the output layer stay float32.

@@ -159,7 +159,7 @@ class UNet(VelocityNetwork):
         return self.time_embed(frequencies) + self.label_emb(labels)
 
     def to_bfloat16_(self) -> Self:
-        """Casts all convolutions between the first and the last to bfloat16, for sampling.
+        """Cast all convolutions between the first and the last to bfloat16, for sampling.
 
         Time embedding, statistics of the norms, the first layer with the position bias and the
         output layer stay float32.

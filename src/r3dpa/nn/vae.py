@@ -312,7 +312,7 @@ class VAE(Autoencoder):
         return torch.cat([seen * (image[:, :1] + 1) - 1, 2 * seen - 1], dim=1)
 
     def decoder_to_bfloat16_(self) -> Self:
-        """Casts the convolutions of the decoder, but for the outputs, to bfloat16 for sampling.
+        """Cast the convolutions of the decoder, but for the outputs, to bfloat16 for sampling.
 
         Statistics of the norms and the result of :meth:`decode` stay float32.
         """

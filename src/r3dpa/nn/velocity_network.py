@@ -123,7 +123,7 @@ class VelocityNetwork(nn.Module, ABC):
 
     @abstractmethod
     def to_bfloat16_(self) -> Self:
-        """Casts the weights of nearly all of the computation to bfloat16 in place.
+        """Cast the weights of nearly all of the computation to bfloat16 in place.
 
         For sampling without autocast. The velocity stays float32, and so does the time embedding:
         neighbouring times coincide in bfloat16.

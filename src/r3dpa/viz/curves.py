@@ -20,8 +20,18 @@ Series = tuple[Sequence[float], Sequence[float]]
 
 #: Safe for colour-blind readers (Okabe and Ito, then Tol), in the order of the solvers.
 COLOURS = (
-    *("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#7f7f7f", "#332288"),
-    *("#882255", "#117733", "#999933", "#000000"),
+    "#0072b2",
+    "#e69f00",
+    "#009e73",
+    "#cc79a7",
+    "#56b4e9",
+    "#d55e00",
+    "#7f7f7f",
+    "#332288",
+    "#882255",
+    "#117733",
+    "#999933",
+    "#000000",
 )
 _MARKERS = "osD^vPX<>hpd"
 

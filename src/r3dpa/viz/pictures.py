@@ -33,8 +33,18 @@ HEIGHT_LIMITS_M = (-2.0, 3.0)  # relative to the sensor, which stands about 1.7 
 EGO_OUTLINE_M = ((0.0, 2.5), (-0.9, 1.0), (-0.9, -2.0), (0.9, -2.0), (0.9, 1.0))  # (y, x)
 # Distinct on the dark background; for categories that come without a colour.
 PALETTE = (
-    *("#4e9bff", "#ffb000", "#3ddc97", "#ff6b6b", "#c792ea", "#5ce1e6", "#f78fb3", "#b5e853"),
-    *("#ff8c42", "#9fa8da", "#e6d690", "#8bd3c7"),
+    "#4e9bff",
+    "#ffb000",
+    "#3ddc97",
+    "#ff6b6b",
+    "#c792ea",
+    "#5ce1e6",
+    "#f78fb3",
+    "#b5e853",
+    "#ff8c42",
+    "#9fa8da",
+    "#e6d690",
+    "#8bd3c7",
 )
 CAMERA_EYE_M = (-20.0, 0.0, 10.5)
 CAMERA_TARGET_M = (12.0, 0.0, -1.0)
@@ -102,17 +112,19 @@ def scene_3d(
     order = np.argsort(-from_eye[:, 2])  # far to near: the rank of a point tells what hides what
     order = order[from_eye[order, 2] > 1.0]
     right, up, depth = from_eye[order].T
+    # A point is a square of side x side pixels, whose first corner is (row, column).
     side = np.clip(np.rint(POINT_WIDTH_M * focal / depth), 1, MAX_POINT_PIXELS).astype(int)
     row = np.floor(height / 2 - focal * up / depth).astype(int) - side // 2
     column = np.floor(width / 2 + focal * right / depth).astype(int) - side // 2
 
+    # Rank of the nearest point of each pixel, -1 for none; one layer for each pixel of the squares.
     nearest = np.full(height * width, -1)
     for down, across in itertools.product(range(MAX_POINT_PIXELS), repeat=2):
         drawn = (side > max(down, across)) & (row + down >= 0) & (row + down < height)
         drawn &= (column + across >= 0) & (column + across < width)
         layer = np.full(height * width, -1)
         ranks = np.flatnonzero(drawn)
-        layer[(row[ranks] + down) * width + column[ranks] + across] = ranks
+        layer[(row[ranks] + down) * width + column[ranks] + across] = ranks  # the last one stays
         np.maximum(nearest, layer, out=nearest)
 
     background = np.array([BACKGROUND], dtype=np.float64)
@@ -131,7 +143,8 @@ def save(picture: Figure | Pixels, path: str | Path) -> Path:
     Raises:
         ValueError: If the format is unknown.
     """
-    with atomic_path(path := Path(path)) as temporary:
+    path = Path(path)
+    with atomic_path(path) as temporary:
         if isinstance(picture, Figure):
             picture.savefig(temporary)
         else:
@@ -142,13 +155,14 @@ def save(picture: Figure | Pixels, path: str | Path) -> Path:
 def palette_image(picture: Figure | Pixels, colours: int = 64) -> Image.Image:
     """The picture with few colours, a third of the size as PNG: for notebooks."""
     if isinstance(picture, Figure):
-        picture.savefig(file := io.BytesIO(), format="png")
+        file = io.BytesIO()
+        picture.savefig(file, format="png")
         return Image.open(file).convert("RGB").quantize(colours)
     return Image.fromarray(picture).quantize(colours)
 
 
 def as_numpy(array: Array, axes: tuple[str, ...]) -> NDArray[np.float64]:
-    """The array in float64 on the CPU, checked to have the named axes."""
+    """The array in float64 on the CPU, checked to have as many axes as there are names."""
     if array.ndim != len(axes):
         raise ValueError(f"expected shape ({', '.join(axes)}), got {tuple(array.shape)}")
     if isinstance(array, Tensor):

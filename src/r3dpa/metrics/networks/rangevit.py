@@ -205,7 +205,7 @@ def range_channels(range_m: Tensor, sensor: LidarSensor, intensity: Tensor | Non
 
 
 def load_official(network: RangeViT, weights: Mapping[str, Tensor]) -> None:
-    """Loads every key of an official state dict but for the point classifier behind the features.
+    """Load every key of an official state dict but for the point classifier behind the features.
 
     Files of the original training lack the normalisation of the input, for which the official code
     has the constants of KITTI-360.
