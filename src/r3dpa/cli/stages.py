@@ -19,6 +19,7 @@ from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveCon
 from lightning.pytorch.loggers import Logger, WandbLogger
 from lightning.pytorch.utilities import rank_zero_info, rank_zero_only
 
+from r3dpa.bench.dry_run import DryRun, batch_lines
 from r3dpa.callbacks import RunCheckpoint, SceneScorer
 from r3dpa.callbacks.loss_bar import LossBar
 from r3dpa.checkpoints import read_checkpoint
@@ -150,8 +151,10 @@ class StageCLI(LightningCLI):
     resumes a job.
     """
 
-    def __init__(self, args: list[str], preset: str | None = None) -> None:
-        self._command, self._preset = args[0], preset
+    def __init__(
+        self, args: list[str], preset: str | None = None, *, dry_run: bool = False
+    ) -> None:
+        self._command, self._preset, self._dry_run = args[0], preset, dry_run
         self._ckpt_step: int | None = None
         super().__init__(
             LightningModule,
@@ -210,6 +213,9 @@ class StageCLI(LightningCLI):
 
     def _run_subcommand(self, subcommand: str) -> None:
         """Run the command, unless another process does the same in ``run_dir``."""
+        if self._dry_run:
+            sys.stdout.write(f"{DryRun(self.model, self.datamodule, self.trainer).describe()}\n")
+            return
         run_dir = Path(self.config[subcommand].run_dir)
         what = f"runs r3dpa {subcommand} in {run_dir}"
         first = cast(Any, rank_zero_only).rank == 0  # known before there is a trainer
@@ -231,22 +237,11 @@ class StageCLI(LightningCLI):
             option, consequence = _WITHOUT_WEIGHTS.get(self.model.stage, ("", ""))
             if option and getattr(self.model, option) is None:
                 rank_zero_info(f"without --model.init_args.{option} {consequence}")
-        self._say_global_batch()
+        for line in batch_lines(self.model, self.datamodule, self.trainer):
+            rank_zero_info(line)
         for callback in cast(Any, self.trainer).callbacks:
             if isinstance(callback, _RecordConfig):
                 callback.hold_wandb_back(self.trainer)
-
-    def _say_global_batch(self) -> None:
-        """Name the samples per step, which grow with the number of processes."""
-        batch_size = getattr(self.datamodule, "batch_size", None)
-        if batch_size is None:
-            return
-        processes = self.trainer.world_size
-        accumulated = self.trainer.accumulate_grad_batches
-        rank_zero_info(
-            f"global batch: {batch_size * processes * accumulated} = {batch_size} per process x "
-            f"{processes} processes x {accumulated} accumulated"
-        )
 
     def after_fit(self) -> None:
         """Name the checkpoint, and the command that takes it."""
@@ -280,6 +275,9 @@ class StageCLI(LightningCLI):
         config = self.config[self.subcommand]
         if self.subcommand == "predict" and config.return_predictions is None:
             config.return_predictions = False  # they are on disk; all of KITTI-360 is 20 GB
+        if self._dry_run:
+            config.trainer.logger = False
+            return
         run_dir = Path(config.run_dir)
         run_dir.mkdir(parents=True, exist_ok=True)
         loggers = config.trainer.logger
@@ -316,7 +314,11 @@ def _newest(run_dir: Path) -> str | None:
 
 
 def run(args: list[str]) -> None:
-    """Run a stage command: ``["fit", "--config", "x.yaml"]``, ``["fit", "joint"]``."""
+    """Run a stage command: ``["fit", "--config", "x.yaml"]``, ``["fit", "joint"]``.
+
+    ``--dry_run`` prints what a ``fit`` takes, and writes nothing.
+    """
     ignore_harmless_notices()
-    words, preset = expand_preset(args[1:])
-    StageCLI([args[0], *find_configs(words)], preset)
+    words, preset = expand_preset([word for word in args[1:] if word != "--dry_run"])
+    dry_run = "--dry_run" in args
+    StageCLI([args[0], *find_configs(words)], preset, dry_run=dry_run)
