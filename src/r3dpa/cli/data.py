@@ -101,6 +101,7 @@ def objects(
     ckpt: Path = Path(DEFAULT_WEIGHTS),
     features_ckpt: Path | None = None,
     limit: PositiveInt = 200,
+    columns: tuple[str, ...] = (),
     device: str = "auto",
 ) -> str:
     """Write the mean feature of each class of labelled scans, for ``r3dpa edit inpaint``.
@@ -113,6 +114,8 @@ def objects(
             where ``r3dpa edit inpaint --object`` finds it.
         features_ckpt: Weights of the feature source, if it has none of its own.
         limit: Maximum number of scans, evenly spaced.
+        columns: Columns of files without names, such as ``x,y,z,intensity,ring``; default: by the
+            values.
         device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
     """
     check_file(out)
@@ -141,7 +144,7 @@ def objects(
         module = read_data(Path(data))
         scans, images = module.limited_split()[0], module.images
     else:
-        scans = find_scans(data)
+        scans = find_scans(data, columns)
     scans = evenly(scans, limit)
     shown = tqdm(scans, unit="scan", desc="objects", disable=None)
     library = object_library(iter(shown), extractor, projection, sit.grid_size, images)

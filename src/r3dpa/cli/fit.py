@@ -28,6 +28,7 @@ _OPTIONS = (
     "preset",
     "run_dir",
     "dry_run",
+    "columns",
     "ckpt_path",
     "allow_import",
     "model",

@@ -68,7 +68,16 @@ _WITHOUT_WEIGHTS = {
 
 
 class StageParser(Parser, LightningArgumentParser):
-    """Parser of stages and data modules."""
+    """Parser of stages and data modules; ``--columns`` is an option of the data as elsewhere."""
+
+    def parse_args(self, args: Any = None, *others: Any, **settings: Any) -> Any:
+        """Parse words, with the place of ``--columns`` among the arguments of the data module."""
+        words = []
+        for word in sys.argv[1:] if args is None else args:
+            name, equals, value = word.partition("=")
+            name = "--data.init_args.columns" if name == "--columns" else name
+            words.append(f"{name}{equals}{value}")
+        return super().parse_args(words, *others, **settings)
 
 
 def ignore_harmless_notices() -> None:
