@@ -31,6 +31,8 @@ MISTAKES = {
     "edit vary --scan no.bin --out x": "--scan no.bin: no such file or folder",
     "edit mix --left a.bin --right b.bin --out x": "s.safetensors was trained without 3D features",
     "data objects --data x --out o.safetensors": "s.safetensors was trained without 3D features",
+    "data check no": "bad: no: is no folder and no file",
+    "data features --data . --extracter x": "--extracter (did you mean --extractor?)",
     "data view no": "no: no such file or folder",
     "data weather no --out x": "no: no such file or folder",
     "data features --data no/data": "--data no/data: no such folder of scans or data YAML",
@@ -55,7 +57,7 @@ for name in ("a.bin", "b.bin"):
 answers = []
 for line in {list(MISTAKES)}:
     text = io.StringIO()
-    with contextlib.redirect_stderr(text):
+    with contextlib.redirect_stderr(text), contextlib.redirect_stdout(text):
         try: main(line.split())
         except SystemExit: pass
         except (ValueError, OSError) as error: text.write(str(error))
@@ -117,6 +119,12 @@ def test_a_message_names_the_option_as_it_is_typed(words, message, capsys):
         main(["fit", "joint", *words.split()])
     (line,) = capsys.readouterr().err.splitlines()
     assert message in line
+
+
+def test_absent_weights_of_an_extractor_are_named_in_one_line(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=r"^data/weights/scalr\.pth: no such file; give ckpt_last"):
+        main(["fit", "joint", "--preset", "kitti360_paper", "--dry_run"])
 
 
 @pytest.mark.parametrize(

@@ -23,14 +23,19 @@ def check(folder: Path, *, columns: tuple[str, ...] = ()) -> None:
         columns: Columns of files without names, such as ``x,y,z,intensity,ring``; default: by the
             values.
     """
+    from lidarsim.cloud_formats import READABLE
     from lidarsim.clouds import files_below, find_files, read_cloud, suffix_of
+
+    if not folder.exists():  # said before torch is imported
+        sys.stdout.write(f"bad: {folder}: is no folder and no file; can be read: {READABLE}\n")
+        sys.exit(1)
     from lidarsim.scan_files import ScanError
     from lidarsim.survey import describe_scan, skipped_files
     from r3dpa.data.scans import RAW, evenly, scan_files
     from r3dpa.data.scans import check as check_scans
 
     is_layout = (folder / RAW).is_dir()
-    files = list(scan_files(folder)) if folder.exists() else []
+    files = list(scan_files(folder))
     kitti = [file for file in sorted(files) if suffix_of(file) == ".bin" and not columns]
     lines: list[str] = []
     text, others, usable = "", list[Path](), True

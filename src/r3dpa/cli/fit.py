@@ -44,6 +44,18 @@ _OPTIONS = (
     "verbose",
     "datamodule",
 )
+_FEATURE_OPTIONS = (
+    "help",
+    "config",
+    "print_config",
+    "data",
+    "columns",
+    "extractor",
+    "ckpt",
+    "grid_sizes",
+    "out",
+    "trainer",
+)
 _CHECKPOINT_OPTIONS = (
     "--ckpt_path",
     "--model.init_args.init_from",
@@ -85,7 +97,7 @@ def features(args: list[str]) -> None:
     for option, value in _options(args[1:]):
         if option == "--data" and "/" in value and not Path(value).exists():
             raise ValueError(f"--data {value}: no such folder of scans or data YAML")
-        _check_trainer_option("data features", option)
+        _check_option("data features", option, _FEATURE_OPTIONS)
     from r3dpa.cli.features import features as write_features
 
     write_features(args)
@@ -133,11 +145,11 @@ def _options(words: list[str]) -> Iterator[tuple[str, str]]:
             yield option, value if equals else following
 
 
-def _check_option(command: str, option: str) -> None:
+def _check_option(command: str, option: str, known: tuple[str, ...]) -> None:
     """Refuse an unknown option."""
     name = option[2:].partition(".")[0].rstrip("+")
-    if not any(known.startswith(name) for known in _OPTIONS):  # argparse takes short forms
-        near = suggestion(option, [f"--{known}" for known in _OPTIONS])
+    if not any(other.startswith(name) for other in known):  # argparse takes short forms
+        near = suggestion(option, [f"--{other}" for other in known])
         _refuse(command, f"unknown option {option}{near}")
     _check_trainer_option(command, option)
 
@@ -167,7 +179,7 @@ def _check_words(command: str, words: list[str]) -> None:
     """Refuse unknown options and absent files, as far as that needs no class."""
     checkpoint_options = () if "--print_config" in words else _CHECKPOINT_OPTIONS
     for option, value in _options(words):
-        _check_option(command, option)
+        _check_option(command, option, _OPTIONS)
         is_yaml = option == "--config" and value.endswith((".yaml", ".yml"))
         if is_yaml and not shipped(value).exists():
             _refuse(command, f"--config: no file {value}")

@@ -137,7 +137,6 @@ class _RecordConfig(SaveConfigCallback):
         path = Path(trainer.default_root_dir) / self.config_filename
         for logger in trainer.loggers:
             if isinstance(logger, WandbLogger) and trainer.is_global_zero:
-                logger._wandb_init.pop("anonymous", None)  # wandb warns of it, even if it is None
                 config = yaml.safe_load(path.read_text(encoding="utf-8"))
                 logger.log_hyperparams(arguments)
                 logger.log_hyperparams(config | {"commit": source_commit()})
@@ -200,6 +199,9 @@ class StageCLI(LightningCLI):
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
         """Show losses in the bar; record the configuration before other callbacks start."""
         trainer: Any = super().instantiate_trainer(**kwargs)
+        for logger in trainer.loggers:
+            if isinstance(logger, WandbLogger):  # wandb warns of it, even if it is None
+                logger._wandb_init.pop("anonymous", None)
         callbacks = [LossBar() if type(c) is TQDMProgressBar else c for c in trainer.callbacks]
         trainer.callbacks = sorted(callbacks, key=lambda c: not isinstance(c, _RecordConfig))
         return cast(Trainer, trainer)

@@ -211,7 +211,10 @@ def check(path: str | Path) -> tuple[str, bool]:
         outside = " (expected 0..1)" if low < 0 or high > 1 else ""
         lines.append(f"intensity: {low:.3g}..{high:.3g}{outside}")
     verdict = f"problems: {len(problems)}" if problems else "all usable"
-    lines.append(f"{root}: {len(scans)} scans in {len(counts)} drives, {verdict}")
+    scans_text = f"{len(scans)} scan{'s' * (len(scans) != 1)}"
+    lines.append(
+        f"{root}: {scans_text} in {len(counts)} drive{'s' * (len(counts) != 1)}, {verdict}"
+    )
     return "\n".join(lines), not problems
 
 
