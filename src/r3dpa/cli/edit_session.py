@@ -227,8 +227,8 @@ class EditSession:
             request["cosine"] = None if result.cosine is None else result.cosine.tolist()
             writer.finish(request)
         return (
-            f"{command}: {self.num} scenes in {options.out}, {result.nfe} network evaluations each,"
-            f" {seconds:.3g} s; errors are in metadata.json\n"
+            f"{command}: {self.num} scene{'s' * (self.num != 1)} in {options.out}, {result.nfe} "
+            f"network evaluations each, {seconds:.3g} s; errors are in metadata.json\n"
             f"open {options.out / 'edit.png'} and {options.out / 'edit.html'}"
         )
 
