@@ -110,7 +110,9 @@ class DryRun:
                 val_every=None,
             )
             if hasattr(module, "latents_dir"):
-                module.latents_dir = None  # the cache of the run itself is for its own scans
+                cast(
+                    Any, module
+                ).latents_dir = None  # the cache of the run itself is for its own scans
             return measure_steps(module, scans, settings, counts_work=False, enough_s=_ENOUGH_S)
 
     def _checkpoints(self) -> list[str]:

@@ -146,7 +146,7 @@ def objects(
     extractor = extractor.to(usable_device(device))
     images = None
     if data.endswith((".yaml", ".yml")):
-        module = read_data(Path(data))
+        module = read_data(Path(data), columns)
         scans, images = module.limited_split()[0], module.images
     else:
         scans = find_scans(data, columns)
