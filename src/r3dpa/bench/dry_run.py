@@ -110,9 +110,8 @@ class DryRun:
                 val_every=None,
             )
             if hasattr(module, "latents_dir"):
-                cast(
-                    Any, module
-                ).latents_dir = None  # the cache of the run itself is for its own scans
+                # The cache of the run itself is for its own scans.
+                cast(Any, module).latents_dir = None
             return measure_steps(module, scans, settings, counts_work=False, enough_s=_ENOUGH_S)
 
     def _checkpoints(self) -> list[str]:
