@@ -35,7 +35,7 @@ def test_an_option_that_fit_refuses_is_named(capsys):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ([str(TABLES / "table_9")], "table_9.yaml is no table"),
+        ([str(TABLES / "table_9")], "table_9: no table or folder of tables"),
         ([str(TABLES), "--scale", "huge"], "unknown scale .*; choose from demo"),
         ([str(TABLES), "--seeds", "0", "0"], "different numbers"),
         ([str(TABLES), "--rgb_weights", "none.pt"], "none.pt does not exist"),

@@ -117,6 +117,17 @@ class TestFiles:
         edit(files, "vary", tmp_path / "again", "--scan", files / "a.bin", "--overwrite")
         assert not (tmp_path / "again" / "mask.png").exists()
 
+    def test_named_columns_of_a_scan(self, files, no_sheet, tmp_path):
+        points = read_scan(files / "a.bin")
+        rows = np.column_stack([points, -points[:, :2]])
+        (tmp_path / "six.bin").write_bytes(rows.tobytes())
+        words = ["--start", 0.3]
+        edit(files, "vary", tmp_path / "four", "--scan", files / "a.bin", *words)
+        words += ["--columns", "x,y,z,intensity,u,v"]
+        edit(files, "vary", tmp_path / "six", "--scan", tmp_path / "six.bin", *words)
+        four, six = (np.load(tmp_path / name / "range_m.npy") for name in ("four", "six"))
+        assert np.array_equal(four, six)
+
     def test_mix_of_two_scans(self, files, no_sheet, tmp_path):
         sides = ["--left", files / "a.bin", "--right", files / "b.bin", "--split", "30"]
         about = edit(files, "mix", tmp_path / "sides", *sides)

@@ -13,7 +13,7 @@ import torch
 import yaml
 
 from r3dpa.cli import main
-from r3dpa.data import FeatureGrids, find_scans
+from r3dpa.data import FeatureGrids, LidarDataModule, find_scans
 from r3dpa.data.datamodules import default_features_dir
 from r3dpa.data.feature_grids import any_settings
 from r3dpa.features import WaffleIron
@@ -173,3 +173,60 @@ def test_two_processes_write_what_one_does(data, expected):
     assert f"{NUM // 2}/{NUM // 2}" in done.stdout  # the bar counts the batches of its own process
     assert f"feature grids: {NUM} made, 0 kept, " in done.stdout.splitlines()[-1]
     assert "Warning" not in done.stderr
+
+
+class TestNamedColumns:
+    """Scans of six columns: ``--columns`` names them in every command that reads a data set."""
+
+    NAMES = "x,y,z,intensity,time,angle"
+
+    @pytest.fixture
+    def scans(self, tmp_path, monkeypatch):
+        """Files of a folder, and the four columns that are read of the first one."""
+        monkeypatch.chdir(tmp_path)
+        rng = np.random.default_rng(1)
+        (tmp_path / "scans").mkdir()
+        for number in range(4):
+            points = rng.uniform((-20, -20, -2, 0), (20, 20, 1, 1), (300, 4))
+            others = rng.uniform(-3, 3, (300, 2))
+            rows = np.concatenate([points, others], axis=1).astype(np.float32)
+            (tmp_path / "scans" / f"{number}.bin").write_bytes(rows.tobytes())
+        return tmp_path / "scans"
+
+    def test_data_module(self, scans):
+        with pytest.raises(ValueError, match="name the columns with --columns"):
+            LidarDataModule(str(scans), sensor=PROJECTION.sensor).points(find_scans(scans)[0])
+        for columns in (self.NAMES, self.NAMES.split(",")):
+            data = LidarDataModule(str(scans), sensor=PROJECTION.sensor, columns=columns)
+            first = np.fromfile(scans / "0.bin", "<f4").reshape(-1, 6)
+            (scan,) = (scan for scan in data.split()[1] if scan.frame == "0")
+            assert data.points(scan).numpy().tolist() == first[:, :4].tolist()
+
+    def test_rows_of_other_columns_are_not_taken_from_a_cache(self, scans):
+        keys = {find_scans(scans, names)[0].cache_key for names in ((), ("x", "y"), ("y", "x"))}
+        assert len(keys) == 3
+
+    def test_features_and_reference(self, scans, tmp_path, capsys):
+        named = ["--columns", self.NAMES]
+        sensor = "--data.init_args.sensor={beams: 16, columns: 64}"
+        size = "--data.init_args.grid_size=[2, 8]"
+        grids, out = str(tmp_path / "grids"), tmp_path / "reference.safetensors"
+        words = [str(scans), *named, sensor, size, *QUIET, "--extractor", "geometric"]
+        main(["data", "features", "--data", *words, "--out", grids])
+        assert "4 made" in capsys.readouterr().out
+        words = [str(scans), *named, "--spaces", "fgeo", "--out", str(out)]
+        main(["data", "reference", "--data", *words])
+        assert out.is_file()
+
+    def test_fit(self, scans, capsys):
+        words = ["fit", "vae_alignment", "--preset", "folder", "--data.init_args.scans", str(scans)]
+        with pytest.raises(SystemExit) as ended:
+            main([*words, f"--columns={self.NAMES}", "--print_config"])
+        assert ended.value.code == 0
+        data = yaml.safe_load(capsys.readouterr().out)["data"]["init_args"]
+        assert data["columns"] == self.NAMES
+
+    def test_the_layout_of_kitti360_has_its_own(self, capsys):
+        with pytest.raises(SystemExit):
+            main(["fit", "vae_alignment", "--columns", self.NAMES])
+        assert "unknown option --data.init_args.columns" in capsys.readouterr().err

@@ -8,6 +8,7 @@ import sys
 import pytest
 
 from r3dpa.cli import ALIASES, COMMANDS, OWN_PARSER, main
+from r3dpa.cli.fit import _check_trainer_option
 from r3dpa.cli.parser import load, make_parser
 from r3dpa.cli.presets import expand_preset, stage_files
 
@@ -20,6 +21,9 @@ MISTAKES = {
     "fit joint --ckpt_path no.ckpt": "--ckpt_path: no checkpoint file no.ckpt",
     "fit joint --model.init_args.init_from no.ckpt": "--model.init_args.init_from: no checkpoint",
     "fit --config no.yaml": "--config: no file no.yaml",
+    "fit joint --trainer.max_stepz 3": "--trainer.max_stepz (did you mean --trainer.max_steps?)",
+    "fit joint --trainer.loger+=x": "--trainer.loger+ (did you mean --trainer.logger?)",
+    "data features --trainer.devises 4": "--trainer.devises (did you mean --trainer.devices?)",
     "smaple": "unknown command 'smaple' (did you mean sample?)",
     "inpant": "unknown command 'inpant' (did you mean inpaint?)",
     "sample --out x --ckpt no.ckpt": "no checkpoint file no.ckpt",
@@ -27,12 +31,17 @@ MISTAKES = {
     "edit vary --scan no.bin --out x": "--scan no.bin: no such file or folder",
     "edit mix --left a.bin --right b.bin --out x": "s.safetensors was trained without 3D features",
     "data objects --data x --out o.safetensors": "s.safetensors was trained without 3D features",
+    "data check no": "bad: no: is no folder and no file",
+    "data features --data . --extracter x": "--extracter (did you mean --extractor?)",
     "data view no": "no: no such file or folder",
     "data weather no --out x": "no: no such file or folder",
     "data features --data no/data": "--data no/data: no such folder of scans or data YAML",
     "data reference --data no --out x.safetensors": "--data no: no such file or folder",
     "convert no.pt x.safetensors": "no.pt: no such file or folder",
     "report no": "no: no such file or folder",
+    "ablate nowhere": "nowhere: no table or folder of tables; choose from conf/ablation",
+    "ablate tabel_3": "no table or folder of tables (did you mean conf/ablation/table_3?)",
+    "ablate conf/ablation --scale dmeo": "unknown scale 'dmeo' (did you mean demo?)",
     "evaluate --samples no --reference no": "--samples no: no such file or folder",
 }
 
@@ -48,7 +57,7 @@ for name in ("a.bin", "b.bin"):
 answers = []
 for line in {list(MISTAKES)}:
     text = io.StringIO()
-    with contextlib.redirect_stderr(text):
+    with contextlib.redirect_stderr(text), contextlib.redirect_stdout(text):
         try: main(line.split())
         except SystemExit: pass
         except (ValueError, OSError) as error: text.write(str(error))
@@ -70,6 +79,15 @@ def test_a_simple_mistake_is_answered_before_torch_is_imported(line, answers):
     assert not imported_torch
 
 
+def test_known_options_of_the_trainer_are_left_to_its_parser():
+    for option in (
+        "--trainer.max_steps",
+        "--trainer.callbacks+",
+        "--trainer.logger.init_args.name",
+    ):
+        _check_trainer_option("fit", option)
+
+
 def test_fit_alone_names_stages_and_presets(answers):
     answer, _ = answers["fit"]
     assert all(f"  {stage} " in answer for stage in ("joint", "vae_alignment", "r2dm"))
@@ -89,7 +107,6 @@ def test_overlays_are_no_stages():
     ("words", "message"),
     [
         ("--model.init_args.init_fron x", "--model.init_args.init_fron (did you mean init_from?)"),
-        ("--trainer.max_stepz 3", "--trainer.max_stepz (did you mean --trainer.max_steps?)"),
         (
             "--model.init_args.sit.init_args.depth many",
             "--model.init_args.sit.init_args.depth: expected int, got 'many'",
@@ -102,6 +119,12 @@ def test_a_message_names_the_option_as_it_is_typed(words, message, capsys):
         main(["fit", "joint", *words.split()])
     (line,) = capsys.readouterr().err.splitlines()
     assert message in line
+
+
+def test_absent_weights_of_an_extractor_are_named_in_one_line(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=r"^data/weights/scalr\.pth: no such file; give ckpt_last"):
+        main(["fit", "joint", "--preset", "kitti360_paper", "--dry_run"])
 
 
 @pytest.mark.parametrize(

@@ -95,7 +95,7 @@ def test_check_says_the_intensities(tmp_path):
     text, usable = check(tmp_path)
     assert usable
     assert "intensity: 0..1\n" in text
-    assert "1 scans in 1 drives, all usable" in text
+    assert "1 scan in 1 drive, all usable" in text
     write_bin(tmp_path / "a.bin", POINTS - np.float32([0, 0, 0, 0.25]))
     (problem,) = problems(tmp_path)
     assert "its values do not fit 4 or 5 columns x, y, z, intensity" in problem

@@ -140,21 +140,19 @@ def make_plan(
             row, by its key.
 
     Raises:
-        ValueError: If a file is missing or invalid, or a seed is negative or occurs twice.
+        ValueError: If a file is invalid, a folder has no table, or a seed is negative or occurs
+            twice.
     """
     if not seeds or len(set(seeds)) < len(seeds) or min(seeds) < 0:
         raise ValueError(f"--seeds must be different numbers from 0 on, got {list(seeds)}")
-    if not scale.is_file():
-        known = sorted(other.stem for other in scale.parent.glob("*.yaml"))
-        raise ValueError(f"unknown scale {scale}; choose from {', '.join(known) or 'your files'}")
     if rgb_weights is not None and not rgb_weights.is_file():
         raise ValueError(f"--rgb_weights {rgb_weights} does not exist")
     about = _read(scale, ("about",), _PARTS_OF_SCALE)
     planner = _Planner(out, about, rgb_weights, cache(resolve))
     released = dict(released or {})
     files = sorted(tables.glob("*.yaml")) if tables.is_dir() else [tables.with_suffix(".yaml")]
-    if not files or not files[0].is_file():
-        raise ValueError(f"{tables} is no table; give a YAML file, or a folder of them")
+    if not files:
+        raise ValueError(f"{tables} holds no table; give a YAML file, or a folder of them")
     planned = [_plan_table(file, planner, seeds, released) for file in files]
     keys = [row.key for table in planned for row in table.rows]
     for key in released:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import tempfile
 import time
 import warnings
@@ -147,7 +148,7 @@ def _in_new_process(
     stage: str, files: list[Path], folder: Path, settings: StepSettings
 ) -> StageCost:
     # spawn: a forked process would share memory with this one.
-    with ProcessPoolExecutor(1, get_context("spawn"), _silence_lightning) as pool:
+    with ProcessPoolExecutor(1, get_context("spawn"), silence_lightning) as pool:
         try:
             return pool.submit(_measure, stage, files, folder, settings).result()
         except BrokenProcessPool as error:
@@ -158,7 +159,7 @@ def _in_new_process(
             ) from error
 
 
-def _silence_lightning() -> None:
+def silence_lightning() -> None:
     """Hide hints about loaders and loggers, which do not apply to a benchmark."""
     warnings.filterwarnings("ignore", module="lightning")
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
@@ -167,23 +168,46 @@ def _silence_lightning() -> None:
 def _measure(stage: str, files: list[Path], folder: Path, settings: StepSettings) -> StageCost:
     L.seed_everything(0, verbose=False)
     module = _build(files, folder / f"{stage}.safetensors")
-    cost = StageCost(stage)
+    data = _data(module, folder, stage, settings.batch_size)
+    return measure_steps(module, data, settings)
+
+
+def measure_steps(
+    module: GenerativeModule,
+    data: LidarDataModule,
+    settings: StepSettings,
+    *,
+    counts_work: bool = True,
+    enough_s: float = math.inf,
+) -> StageCost:
+    """Train a module for some steps, and for one more to count its FLOP.
+
+    Files that the stage makes, such as caches, lie beside the feature grids of the data.
+
+    Args:
+        module: Stage to train.
+        data: Scans, with a folder of feature grids.
+        settings: Steps, batch size, precision and device.
+        counts_work: Whether to count FLOP.
+        enough_s: End after the step that reaches this time in all.
+    """
+    cost = StageCost(module.stage)
     trainer = L.Trainer(
         accelerator=settings.device,
         devices=1,
         precision=settings.precision,
-        max_steps=settings.steps + 1,  # the work of the last one is counted
+        max_steps=settings.steps + counts_work,
         max_epochs=-1,
         gradient_clip_val=1.0,
         limit_val_batches=0,
         logger=False,
-        callbacks=[_StepMeter(settings.steps, cost)],
+        callbacks=[_StepMeter(settings.steps, cost, enough_s)],
         enable_checkpointing=False,
         enable_progress_bar=False,
         enable_model_summary=False,
-        default_root_dir=folder,
+        default_root_dir=cast(Path, data.features_dir).parent,
     )
-    trainer.fit(module, datamodule=_data(module, folder, stage, settings.batch_size))
+    trainer.fit(module, datamodule=data)
     seconds = median(cost.step_seconds[1:] or cost.step_seconds)
     cost.images_per_second = settings.batch_size / seconds
     return cost
@@ -232,8 +256,8 @@ def _data(module: GenerativeModule, folder: Path, stage: str, batch_size: int) -
 class _StepMeter(L.Callback):
     """Time of each step with its batch on the device, loss and memory; FLOP of one step more."""
 
-    def __init__(self, steps: int, cost: StageCost) -> None:
-        self.steps, self.cost, self._start = steps, cost, 0.0
+    def __init__(self, steps: int, cost: StageCost, enough_s: float) -> None:
+        self.steps, self.cost, self.enough_s, self._start = steps, cost, enough_s, 0.0
         self._counting = ExitStack()
         self._counter = FlopCounterMode(display=False)
 
@@ -251,6 +275,7 @@ class _StepMeter(L.Callback):
             self.cost.flop = self._counter.get_total_flops()
             return
         self.cost.step_seconds.append(self._now(trainer) - self._start)
+        trainer.should_stop = sum(self.cost.step_seconds) >= self.enough_s
         self.cost.loss = float(trainer.callback_metrics["train/loss"])
         self.cost.peak_host_bytes = peak_bytes(torch.device("cpu"))
         self.cost.peak_gpu_bytes = peak_bytes(device) if device.type == "cuda" else None

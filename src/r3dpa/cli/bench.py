@@ -14,7 +14,9 @@ from typing import Any, Literal
 import yaml
 from jsonargparse.typing import PositiveInt
 
+from r3dpa.cli.messages import suggestion
 from r3dpa.cli.parser import check_file, check_folder
+from r3dpa.cli.presets import conf_folder, shipped
 
 
 def training(
@@ -39,7 +41,6 @@ def training(
         quick: The demo's networks.
     """
     from r3dpa.bench import training as bench
-    from r3dpa.cli.presets import conf_folder
 
     check_file(out)
     settings = bench.StepSettings(batch_size, steps, precision, device, quick)
@@ -121,17 +122,19 @@ def ablate(
             ``online``.
         budget_only: Print number and length of the trainings, and start nothing.
     """
-    from r3dpa import ablation
-    from r3dpa.cli.presets import shipped
-    from r3dpa.io import only_writer
-
-    tables = shipped(tables)
-    if not tables.is_dir() and not tables.suffix:
-        tables = shipped(f"{tables}.yaml")
-    scale_file = Path(scale)
+    tables, scale_file = _find_tables(tables), Path(scale)
     if scale_file.suffix not in (".yaml", ".yml"):
         parent = tables if tables.is_dir() else tables.parent
         scale_file = parent / "scale" / f"{scale}.yaml"
+    if not scale_file.is_file():
+        known = sorted(path.stem for path in scale_file.parent.glob("*.yaml"))
+        choices = ", ".join(known) or "your files"
+        raise ValueError(
+            f"unknown scale '{scale}'{suggestion(scale, known)}; choose from {choices}"
+        )
+    from r3dpa import ablation
+    from r3dpa.io import only_writer
+
     folder = out or Path("runs/ablation") / scale_file.stem
     check_folder(folder)
     plan = ablation.make_plan(
@@ -153,6 +156,25 @@ def ablate(
     _say(f"tables: {', '.join(str(file) for file in files if file.is_file()) or 'none'}")
     if failed:
         sys.exit(1)
+
+
+def _find_tables(tables: Path) -> Path:
+    """Return the file or folder of tables, here or in the package.
+
+    Raises:
+        ValueError: If there is none.
+    """
+    path = shipped(tables)
+    if not path.exists() and not path.suffix:
+        path = shipped(f"{tables}.yaml")
+    if not path.exists():
+        known = sorted(table.stem for table in (conf_folder() / "ablation").glob("*.yaml"))
+        near = suggestion(tables.stem, known).replace("mean ", "mean conf/ablation/")
+        raise ValueError(
+            f"{tables}: no table or folder of tables{near}; choose from conf/ablation (all tables) "
+            f"and its {', '.join(known)}, or give a YAML of that kind"
+        )
+    return path
 
 
 def resolve_config(words: Sequence[str]) -> dict[str, Any]:

@@ -16,7 +16,7 @@ complete -o default -F _r3dpa r3dpa"""
 # Of commands whose parsers need torch: the options that people type most.
 _FEATURES = "--data --extractor --ckpt --grid_sizes --out --config --trainer.devices"
 _STAGE = (
-    "--preset --config --run_dir --ckpt_path --print_config --model.init_args.init_from "
+    "--preset --config --run_dir --dry_run --ckpt_path --print_config --model.init_args.init_from "
     "--model.init_args.rgb_weights --trainer.max_steps --trainer.devices "
     "--data.init_args.batch_size"
 )

@@ -23,14 +23,19 @@ def check(folder: Path, *, columns: tuple[str, ...] = ()) -> None:
         columns: Columns of files without names, such as ``x,y,z,intensity,ring``; default: by the
             values.
     """
+    from lidarsim.cloud_formats import READABLE
     from lidarsim.clouds import files_below, find_files, read_cloud, suffix_of
+
+    if not folder.exists():  # said before torch is imported
+        sys.stdout.write(f"bad: {folder}: is no folder and no file; can be read: {READABLE}\n")
+        sys.exit(1)
     from lidarsim.scan_files import ScanError
     from lidarsim.survey import describe_scan, skipped_files
     from r3dpa.data.scans import RAW, evenly, scan_files
     from r3dpa.data.scans import check as check_scans
 
     is_layout = (folder / RAW).is_dir()
-    files = list(scan_files(folder)) if folder.exists() else []
+    files = list(scan_files(folder))
     kitti = [file for file in sorted(files) if suffix_of(file) == ".bin" and not columns]
     lines: list[str] = []
     text, others, usable = "", list[Path](), True
@@ -101,6 +106,7 @@ def objects(
     ckpt: Path = Path(DEFAULT_WEIGHTS),
     features_ckpt: Path | None = None,
     limit: PositiveInt = 200,
+    columns: tuple[str, ...] = (),
     device: str = "auto",
 ) -> str:
     """Write the mean feature of each class of labelled scans, for ``r3dpa edit inpaint``.
@@ -113,6 +119,8 @@ def objects(
             where ``r3dpa edit inpaint --object`` finds it.
         features_ckpt: Weights of the feature source, if it has none of its own.
         limit: Maximum number of scans, evenly spaced.
+        columns: Columns of files without names, such as ``x,y,z,intensity,ring``; default: by the
+            values.
         device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
     """
     check_file(out)
@@ -138,10 +146,10 @@ def objects(
     extractor = extractor.to(usable_device(device))
     images = None
     if data.endswith((".yaml", ".yml")):
-        module = read_data(Path(data))
+        module = read_data(Path(data), columns)
         scans, images = module.limited_split()[0], module.images
     else:
-        scans = find_scans(data)
+        scans = find_scans(data, columns)
     scans = evenly(scans, limit)
     shown = tqdm(scans, unit="scan", desc="objects", disable=None)
     library = object_library(iter(shown), extractor, projection, sit.grid_size, images)

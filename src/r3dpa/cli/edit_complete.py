@@ -104,7 +104,7 @@ class CompletionJob:
 
     def read(self, path: Path) -> tuple[PointCloud, ScanView, Tensor]:
         """A scan, its view, and the mask of what is missing."""
-        session, cloud = _session(self.options, self.num), read_cloud(path)
+        session, cloud = _session(self.options, self.num), read_cloud(path, self.options.columns)
         view = session.view(path, cloud, only_in_view=True)
         missing = self.missing.find(view.range_m, session)
         session.check(view, missing)

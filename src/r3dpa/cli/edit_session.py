@@ -106,7 +106,7 @@ class EditSession:
 
     def read(self, path: Path) -> ScanView:
         """Read a scan, which must fill the field of view."""
-        clouds = read_clouds(path)
+        clouds = read_clouds(path, self.options.columns)
         if len(clouds) > 1:
             names = ", ".join(list(clouds)[:3])
             raise ScanError(f"{path}: holds {len(clouds)} scans ({names}); give a file of one")
@@ -227,8 +227,8 @@ class EditSession:
             request["cosine"] = None if result.cosine is None else result.cosine.tolist()
             writer.finish(request)
         return (
-            f"{command}: {self.num} scenes in {options.out}, {result.nfe} network evaluations each,"
-            f" {seconds:.3g} s; errors are in metadata.json\n"
+            f"{command}: {self.num} scene{'s' * (self.num != 1)} in {options.out}, {result.nfe} "
+            f"network evaluations each, {seconds:.3g} s; errors are in metadata.json\n"
             f"open {options.out / 'edit.png'} and {options.out / 'edit.html'}"
         )
 
@@ -247,6 +247,7 @@ class EditSession:
             settings = {"steps": options.steps}
         left_out = ("options", "num", "workers")
         request = {name: value for name, value in arguments.items() if name not in left_out}
+        request |= {"columns": options.columns} if options.columns else {}
         request |= provenance(self.checkpoint, options, self.num, self.device, self.geometry)
         request |= {"command": command, "guided": guided, "settings": settings, **sources}
         return dict(json_values(request, default=str))  # paths as text

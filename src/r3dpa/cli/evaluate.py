@@ -22,6 +22,7 @@ def reference(
     ckpt: dict[str, Path] | None = None,
     split: Literal["train", "val", "all"] = "all",
     limit: PositiveInt | None = None,
+    columns: tuple[str, ...] = (),
     protocol: Literal["default", "published"] = "default",
     device: str = "auto",
 ) -> str:
@@ -38,6 +39,8 @@ def reference(
         ckpt: Weights by space, such as ``--ckpt.frid model.ckpt``.
         split: Part of the data.
         limit: Maximum scans, evenly spaced.
+        columns: Columns of files without names, such as ``x,y,z,intensity,ring``; default: by the
+            values.
         protocol: ``published`` prepares scans as the published numbers do: points on the corners
             of pixels, and pictures of LIP-Loc that wrap around.
         device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
@@ -52,7 +55,7 @@ def reference(
     check_file(out)
     if out.exists():
         raise ValueError(f"{out} exists: delete it, or give another --out")
-    module = read_data(data)
+    module = read_data(data, columns)
     train, val = module.limited_split()
     scans = evenly({"train": train, "val": val, "all": sorted(train + val)}[split], limit)
     if len(scans) < 2:
@@ -171,18 +174,22 @@ def _made_with(samples: Path) -> dict[str, Any]:
     return made_with | {"sampler": sampler, "made_by_commit": metadata.get("commit")}
 
 
-def realism(*, scans: Path, reference: Path, out: Path | None = None) -> Any:
+def realism(
+    *, scans: Path, reference: Path, columns: tuple[str, ...] = (), out: Path | None = None
+) -> Any:
     """Compare scans with real ones, each measure beside the distance between real drives.
 
     Args:
         scans: Folder of ``.bin`` scans (A); one drive per folder.
         reference: Folder of real scans (B); a single drive gives no floor.
+        columns: Columns of files without names, such as ``x,y,z,intensity,ring``; default: by the
+            values.
         out: JSON file for the table.
     """
     from tqdm import tqdm
 
     from lidarsim.realism import realism_table
-    from lidarsim.scan_files import ScanError, read_scan
+    from lidarsim.scan_files import ScanError
     from lidarsim.scan_statistics import ScanStatistics, scan_statistics
     from r3dpa.data.scans import find_scans
     from r3dpa.io import write_text
@@ -191,8 +198,8 @@ def realism(*, scans: Path, reference: Path, out: Path | None = None) -> Any:
 
     def statistics_by_drive(folder: Path, name: str) -> dict[str, ScanStatistics]:
         drives: dict[str, ScanStatistics] = defaultdict(ScanStatistics)
-        for scan in tqdm(find_scans(folder), name, unit="scan", disable=None):
-            points = read_scan(scan.path)
+        for scan in tqdm(find_scans(folder, columns), name, unit="scan", disable=None):
+            points = scan.read()
             try:
                 drives[scan.drive] += scan_statistics(points)
             except ValueError as error:

@@ -111,13 +111,15 @@ def _extract(data: LidarDataModule, trainer: Trainer, sizes: list[tuple[int, int
         )
 
 
-def read_data(source: Path) -> LidarDataModule:
+def read_data(source: Path, columns: Sequence[str] = ()) -> LidarDataModule:
     """Make the data module of a folder of scans or a data YAML, without features.
 
-    Simulates the scans of a data YAML where they are missing.
+    Simulates the scans of a data YAML where they are missing. ``columns`` names the columns of
+    files without names.
     """
     parser = features_parser("r3dpa data reference")
-    config = parser.parse_args(with_data_class(["--data", str(source)]))
+    words = with_data_class(["--data", str(source)])
+    config = parser.parse_args([*words, f"--columns={','.join(columns)}"] if columns else words)
     config.data.init_args.extractor = config.data.init_args.features_dir = None
     module: LidarDataModule = parser.instantiate(config).data
     if source.is_file():
@@ -155,7 +157,8 @@ def features_parser(prog: str) -> StageParser:
         prog=prog,
         description="Write the feature grids of all scans of --data: a folder of scans, in the "
         "KITTI-360 layout or any other, or a data YAML. The same command completes an interrupted "
-        "run. Several devices and nodes share the work.",
+        "run. Several devices and nodes share the work. --columns names the columns of files "
+        "without names, such as x,y,z,intensity,ring.",
     )
     parser.add_argument("--config", action="config", help="YAML, the same as after --data")
     parser.add_lightning_class_args(LidarDataModule, "data", subclass_mode=True)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import sys
 from collections.abc import Iterator
+from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
 from typing import NoReturn
@@ -11,9 +13,9 @@ from typing import NoReturn
 from r3dpa.cli.messages import suggestion
 from r3dpa.cli.presets import (
     DEFAULT_PRESET,
-    conf_folder,
     expand_preset,
     preset_names,
+    shipped,
     stage_files,
 )
 from r3dpa.pretrained import weights_file
@@ -25,6 +27,8 @@ _OPTIONS = (
     "print_config",
     "preset",
     "run_dir",
+    "dry_run",
+    "columns",
     "ckpt_path",
     "allow_import",
     "model",
@@ -39,6 +43,18 @@ _OPTIONS = (
     "return_predictions",
     "verbose",
     "datamodule",
+)
+_FEATURE_OPTIONS = (
+    "help",
+    "config",
+    "print_config",
+    "data",
+    "columns",
+    "extractor",
+    "ckpt",
+    "grid_sizes",
+    "out",
+    "trainer",
 )
 _CHECKPOINT_OPTIONS = (
     "--ckpt_path",
@@ -57,6 +73,8 @@ def run(args: list[str]) -> None:
     """
     command, words = args[0], args[1:]
     _check_words(command, words)
+    if "--dry_run" in words and command != "fit":
+        _refuse(command, "--dry_run is an option of r3dpa fit")
     overview = _overview(command)
     if "-h" in words or "--help" in words:
         sys.stdout.write(f"{overview}\n")
@@ -79,6 +97,7 @@ def features(args: list[str]) -> None:
     for option, value in _options(args[1:]):
         if option == "--data" and "/" in value and not Path(value).exists():
             raise ValueError(f"--data {value}: no such folder of scans or data YAML")
+        _check_option("data features", option, _FEATURE_OPTIONS)
     from r3dpa.cli.features import features as write_features
 
     write_features(args)
@@ -107,6 +126,8 @@ def _overview(command: str) -> str:
         lines.append(f"  {stage:<17}{comment.partition(': ')[0].rstrip(':.')}")
     lines += ["", f"presets (data; default: {DEFAULT_PRESET}):", f"  {', '.join(preset_names())}"]
     lines += ["", "A run writes to --run_dir; --ckpt_path last resumes it."]
+    if command == "fit":
+        lines += ["--dry_run prints batch, time, memory and disk of a run, and writes nothing."]
     return "\n".join(lines)
 
 
@@ -124,16 +145,43 @@ def _options(words: list[str]) -> Iterator[tuple[str, str]]:
             yield option, value if equals else following
 
 
+def _check_option(command: str, option: str, known: tuple[str, ...]) -> None:
+    """Refuse an unknown option."""
+    name = option[2:].partition(".")[0].rstrip("+")
+    if not any(other.startswith(name) for other in known):  # argparse takes short forms
+        near = suggestion(option, [f"--{other}" for other in known])
+        _refuse(command, f"unknown option {option}{near}")
+    _check_trainer_option(command, option)
+
+
+def _check_trainer_option(command: str, option: str) -> None:
+    """Refuse an option that names no argument of the trainer."""
+    group, _, keys = option.partition(".")
+    name = keys.partition(".")[0].rstrip("+")
+    if group == "--trainer" and name:
+        known = ["help", *_trainer_arguments()]
+        if not any(argument.startswith(name) for argument in known):
+            near = suggestion(name, known).replace("mean ", "mean --trainer.")
+            _refuse(command, f"unknown option {option}{near}")
+
+
+def _trainer_arguments() -> list[str]:
+    """Arguments of Lightning's trainer, from its source: its import takes seconds."""
+    (package,) = find_spec("lightning").submodule_search_locations  # type: ignore[union-attr, misc]
+    tree = ast.parse(Path(package, "pytorch", "trainer", "trainer.py").read_text(encoding="utf-8"))
+    (trainer,) = (node for node in tree.body if isinstance(node, ast.ClassDef))
+    functions = [node for node in trainer.body if isinstance(node, ast.FunctionDef)]
+    (init,) = (function for function in functions if function.name == "__init__")
+    return [argument.arg for argument in (*init.args.args[1:], *init.args.kwonlyargs)]
+
+
 def _check_words(command: str, words: list[str]) -> None:
     """Refuse unknown options and absent files, as far as that needs no class."""
     checkpoint_options = () if "--print_config" in words else _CHECKPOINT_OPTIONS
     for option, value in _options(words):
-        name = option[2:].partition(".")[0].rstrip("+")
-        if not any(known.startswith(name) for known in _OPTIONS):  # argparse takes short forms
-            near = suggestion(option, [f"--{known}" for known in _OPTIONS])
-            _refuse(command, f"unknown option {option}{near}")
-        is_file = Path(value).exists() or (conf_folder().parent / value).exists()
-        if option == "--config" and value.endswith((".yaml", ".yml")) and not is_file:
+        _check_option(command, option, _OPTIONS)
+        is_yaml = option == "--config" and value.endswith((".yaml", ".yml"))
+        if is_yaml and not shipped(value).exists():
             _refuse(command, f"--config: no file {value}")
         if option in checkpoint_options and not value.startswith((*_CHECKPOINT_WORDS, "hf:/")):
             try:

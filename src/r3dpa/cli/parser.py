@@ -105,6 +105,16 @@ class Parser(ArgumentParser):
             words.append(f"{name}{equals}{current_path(value)}")
         return super().parse_args(words, *others, **settings)
 
+    def instantiate(self, *args: Any, **settings: Any) -> Any:
+        """Make the objects; an error of an optional one is its own, not about each type."""
+        try:
+            return super().instantiate(*args, **settings)
+        except ValueError as error:
+            cause: BaseException = error
+            while "Union subtypes" in str(cause) and isinstance(cause.__cause__, ValueError):
+                cause = cause.__cause__
+            raise cause from None
+
     def format_help(self, *formatter: Any) -> str:  # which jsonargparse 4.53 gives
         """Help of the options, and of the fields of each optional dataclass."""
         texts = [super().format_help(*formatter)]
@@ -215,12 +225,7 @@ def parse(
 def run_function(function: Callable[..., Any], words: Sequence[str], prog: str) -> Any:
     """Call a function with the arguments of a command line; return its result."""
     parser, config = parse(function, words, prog)
-    try:
-        arguments = parser.instantiate(config).as_dict()
-    except ValueError as error:  # of an optional dataclass: the cause is its own check
-        if "Union subtypes" in str(error) and isinstance(error.__cause__, ValueError):
-            raise error.__cause__ from None
-        raise
+    arguments = parser.instantiate(config).as_dict()
     arguments.pop("config", None)
     _check_inputs(arguments)
     return function(**arguments)
@@ -280,11 +285,14 @@ class EditOptions(SceneOptions):
         solver: ODE solver, to noise and back; ``midpoint`` has the least error there and back.
         steps: Solver steps from data to noise.
         shift: Finer steps near noise (above 1) or data (below 1).
+        columns: Columns of files without names, such as ``x,y,z,intensity,ring``; default: by the
+            values.
     """
 
     solver: ODESolver = "midpoint"
     steps: int = 32
     shift: float = 1.0
+    columns: tuple[str, ...] = ()
 
 
 def check_folder(out: Path | None) -> None:

@@ -19,6 +19,7 @@ from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveCon
 from lightning.pytorch.loggers import Logger, WandbLogger
 from lightning.pytorch.utilities import rank_zero_info, rank_zero_only
 
+from r3dpa.bench.dry_run import DryRun, batch_lines
 from r3dpa.callbacks import RunCheckpoint, SceneScorer
 from r3dpa.callbacks.loss_bar import LossBar
 from r3dpa.checkpoints import read_checkpoint
@@ -67,7 +68,16 @@ _WITHOUT_WEIGHTS = {
 
 
 class StageParser(Parser, LightningArgumentParser):
-    """Parser of stages and data modules."""
+    """Parser of stages and data modules; ``--columns`` is an option of the data as elsewhere."""
+
+    def parse_args(self, args: Any = None, *others: Any, **settings: Any) -> Any:
+        """Parse words, with the place of ``--columns`` among the arguments of the data module."""
+        words = []
+        for word in sys.argv[1:] if args is None else args:
+            name, equals, value = word.partition("=")
+            name = "--data.init_args.columns" if name == "--columns" else name
+            words.append(f"{name}{equals}{value}")
+        return super().parse_args(words, *others, **settings)
 
 
 def ignore_harmless_notices() -> None:
@@ -127,7 +137,6 @@ class _RecordConfig(SaveConfigCallback):
         path = Path(trainer.default_root_dir) / self.config_filename
         for logger in trainer.loggers:
             if isinstance(logger, WandbLogger) and trainer.is_global_zero:
-                logger._wandb_init.pop("anonymous", None)  # wandb warns of it, even if it is None
                 config = yaml.safe_load(path.read_text(encoding="utf-8"))
                 logger.log_hyperparams(arguments)
                 logger.log_hyperparams(config | {"commit": source_commit()})
@@ -150,8 +159,10 @@ class StageCLI(LightningCLI):
     resumes a job.
     """
 
-    def __init__(self, args: list[str], preset: str | None = None) -> None:
-        self._command, self._preset = args[0], preset
+    def __init__(
+        self, args: list[str], preset: str | None = None, *, dry_run: bool = False
+    ) -> None:
+        self._command, self._preset, self._dry_run = args[0], preset, dry_run
         self._ckpt_step: int | None = None
         super().__init__(
             LightningModule,
@@ -188,6 +199,9 @@ class StageCLI(LightningCLI):
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
         """Show losses in the bar; record the configuration before other callbacks start."""
         trainer: Any = super().instantiate_trainer(**kwargs)
+        for logger in trainer.loggers:
+            if isinstance(logger, WandbLogger):  # wandb warns of it, even if it is None
+                logger._wandb_init.pop("anonymous", None)
         callbacks = [LossBar() if type(c) is TQDMProgressBar else c for c in trainer.callbacks]
         trainer.callbacks = sorted(callbacks, key=lambda c: not isinstance(c, _RecordConfig))
         return cast(Trainer, trainer)
@@ -210,6 +224,9 @@ class StageCLI(LightningCLI):
 
     def _run_subcommand(self, subcommand: str) -> None:
         """Run the command, unless another process does the same in ``run_dir``."""
+        if self._dry_run:
+            sys.stdout.write(f"{DryRun(self.model, self.datamodule, self.trainer).describe()}\n")
+            return
         run_dir = Path(self.config[subcommand].run_dir)
         what = f"runs r3dpa {subcommand} in {run_dir}"
         first = cast(Any, rank_zero_only).rank == 0  # known before there is a trainer
@@ -231,22 +248,11 @@ class StageCLI(LightningCLI):
             option, consequence = _WITHOUT_WEIGHTS.get(self.model.stage, ("", ""))
             if option and getattr(self.model, option) is None:
                 rank_zero_info(f"without --model.init_args.{option} {consequence}")
-        self._say_global_batch()
+        for line in batch_lines(self.model, self.datamodule, self.trainer):
+            rank_zero_info(line)
         for callback in cast(Any, self.trainer).callbacks:
             if isinstance(callback, _RecordConfig):
                 callback.hold_wandb_back(self.trainer)
-
-    def _say_global_batch(self) -> None:
-        """Name the samples per step, which grow with the number of processes."""
-        batch_size = getattr(self.datamodule, "batch_size", None)
-        if batch_size is None:
-            return
-        processes = self.trainer.world_size
-        accumulated = self.trainer.accumulate_grad_batches
-        rank_zero_info(
-            f"global batch: {batch_size * processes * accumulated} = {batch_size} per process x "
-            f"{processes} processes x {accumulated} accumulated"
-        )
 
     def after_fit(self) -> None:
         """Name the checkpoint, and the command that takes it."""
@@ -280,6 +286,9 @@ class StageCLI(LightningCLI):
         config = self.config[self.subcommand]
         if self.subcommand == "predict" and config.return_predictions is None:
             config.return_predictions = False  # they are on disk; all of KITTI-360 is 20 GB
+        if self._dry_run:
+            config.trainer.logger = False
+            return
         run_dir = Path(config.run_dir)
         run_dir.mkdir(parents=True, exist_ok=True)
         loggers = config.trainer.logger
@@ -316,7 +325,11 @@ def _newest(run_dir: Path) -> str | None:
 
 
 def run(args: list[str]) -> None:
-    """Run a stage command: ``["fit", "--config", "x.yaml"]``, ``["fit", "joint"]``."""
+    """Run a stage command: ``["fit", "--config", "x.yaml"]``, ``["fit", "joint"]``.
+
+    ``--dry_run`` prints what a ``fit`` takes, and writes nothing.
+    """
     ignore_harmless_notices()
-    words, preset = expand_preset(args[1:])
-    StageCLI([args[0], *find_configs(words)], preset)
+    words, preset = expand_preset([word for word in args[1:] if word != "--dry_run"])
+    dry_run = "--dry_run" in args
+    StageCLI([args[0], *find_configs(words)], preset, dry_run=dry_run)

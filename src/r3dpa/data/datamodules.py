@@ -16,7 +16,6 @@ from torch.utils.data import DataLoader
 
 from lidarsim import TRAIN_DRIVES, VAL_DRIVES, simulate, split_scans
 from lidarsim.drive_files import drive_name
-from lidarsim.scan_files import read_scan
 from lidarsim.scene import Conditions
 from lidarsim.weather import WeatherPrior
 from r3dpa.data.augmentation import Augmentation, AugmentedDataset
@@ -73,6 +72,8 @@ class LidarDataModule(LoaderModule):
             look alike: hold out whole recordings by ``val_drives`` for an honest score.
         val_drives: Folders, relative to the root, that are held out whole; replaces ``val_every``.
         limit: Maximum scans per split, evenly spaced.
+        columns: Columns of files without names, such as ``x,y,z,intensity,time``; by default as the
+            values show.
         prepare_data_per_node: Whether one process of each node prepares the data, as node-local
             disks need; by default one process of all does, for a disk that the nodes share.
         augmentation: Rotation and mirroring of training scans; none by default.
@@ -101,6 +102,7 @@ class LidarDataModule(LoaderModule):
         val_every: int | None = 10,
         val_drives: list[str] | None = None,
         limit: int | None = None,
+        columns: str | list[str] | None = None,
         prepare_data_per_node: bool = False,
         augmentation: Augmentation = _AUGMENTATION,
         weather: WeatherPrior | None = None,
@@ -115,6 +117,7 @@ class LidarDataModule(LoaderModule):
                 f"{sensor!r}; the instrument of simulated scans is simulation_sensor"
             )
         self.scans, self.sensor, self.codec = scans, sensor, codec
+        self.columns = tuple(columns.split(",") if isinstance(columns, str) else columns or ())
         self.projection_kind = projection
         self.grid_size = (grid_size[0], grid_size[1])
         self.extractor = extractor
@@ -176,7 +179,7 @@ class LidarDataModule(LoaderModule):
         Raises:
             ValueError: If there is no scan, or ``val_drives`` names a folder without one.
         """
-        scans = find_scans(self.scans)
+        scans = find_scans(self.scans, self.columns)
         if self.val_drives:
             drives = {scan.drive for scan in scans}
             if unknown := set(self.val_drives) - drives:
@@ -195,7 +198,7 @@ class LidarDataModule(LoaderModule):
 
     def points(self, scan: Scan) -> Tensor:
         """Points ``(P, 3)`` or ``(P, 4)`` of one of the scans, metres and intensity."""
-        return torch.from_numpy(read_scan(scan.path, self.sensor))
+        return torch.from_numpy(scan.read(self.sensor))
 
     def prepare_data(self) -> None:
         """Make the missing feature grids, except to predict."""
@@ -279,8 +282,8 @@ class LidarDataModule(LoaderModule):
         train, val = self.split()
         projection: Projection = SphericalProjection(self.sensor)
         if self.projection_kind == "rings":
-            files = [scan.path for scan in (train or val)[:_SCANS_TO_FIT]]
-            points = (torch.from_numpy(read_scan(file, self.sensor)[:, :3]) for file in files)
+            first = (train or val)[:_SCANS_TO_FIT]
+            points = (torch.from_numpy(scan.read(self.sensor)[:, :3]) for scan in first)
             projection = RingProjection.fit(points, self.sensor)
         return evenly(train, self.limit), evenly(val, self.limit), projection
 
@@ -318,8 +321,8 @@ class KITTI360DataModule(LidarDataModule):
     """
 
     def __init__(self, root: str, **kwargs: Any) -> None:
-        # Given here, they are no options of the YAML: the split is fixed.
-        super().__init__(scans=root, val_every=None, val_drives=None, **kwargs)
+        # Given here, they are no options of the YAML: split and columns are fixed.
+        super().__init__(scans=root, val_every=None, val_drives=None, columns=None, **kwargs)
         self.root = root
 
     @property
@@ -360,7 +363,7 @@ class SimulatedDataModule(LidarDataModule):
         weather: Conditions | None = None,
         **kwargs: Any,
     ) -> None:
-        super().__init__(scans=root, val_every=None, val_drives=None, **kwargs)
+        super().__init__(scans=root, val_every=None, val_drives=None, columns=None, **kwargs)
         at_least(2, num_scans=num_scans)  # one of them is held out
         self.root, self.num_scans, self.simulation_seed = root, num_scans, simulation_seed
         self.simulation_sensor, self.effects, self.weather = simulation_sensor, effects, weather

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from lidarsim.scan_files import ScanError, out_of_range, read_scan
+from lidarsim.scan_files import ScanError, out_of_range
 from lidarsim.weather import WeatherPrior
 from r3dpa.data.labels import find_labels, read_labels
 from r3dpa.data.scans import Scan
@@ -109,7 +109,7 @@ class LidarDataset(Dataset[dict[str, Any]]):
         """Ranges and, where the codec takes them, intensities and classes."""
         if self.images is not None:
             return self.images.read(scan)
-        read, codec = read_scan(scan.path), self.codec
+        read, codec = scan.read(), self.codec
         points = torch.from_numpy(read if change is None else change(read))
         # Labels are of the points as they were read: a data module refuses both together.
         labels = torch.from_numpy(read_labels(scan.path, len(read))) if codec.num_classes else None
@@ -155,7 +155,7 @@ class PointDataset(Dataset[Any]):
     def __getitem__(self, index: int) -> PointSample:
         scan = self.scans[index]
         key = scan.cache_key
-        points = torch.from_numpy(read_scan(scan.path, self.sensor))
+        points = torch.from_numpy(scan.read(self.sensor))
         return PointSample(scan, key, points, self.prepare(points))
 
 
@@ -175,7 +175,7 @@ class DrawnPoints(PointDataset):
     def __getitem__(self, key: tuple[int, int] | int) -> Any:
         epoch, index = key if isinstance(key, tuple) else (0, key)
         if self.images is None:
-            read = read_scan(self.scans[index].path, self.sensor)
+            read = self.scans[index].read(self.sensor)
         else:
             read = points_at_pixels(self.images.read(self.scans[index]), self.sensor).numpy()
         if self.weather is not None and isinstance(key, tuple):

@@ -11,6 +11,7 @@ from multiprocessing.pool import ThreadPool
 from pathlib import Path
 from typing import Literal, TypeVar
 
+import numpy as np
 from tqdm import tqdm
 
 from lidarsim import TRAIN_DRIVES, VAL_DRIVES, drive_name, expected_scans
@@ -37,12 +38,14 @@ class Scan:
     """One sensor sweep in a file.
 
     ``drive`` is the KITTI-360 drive, or the folder relative to the root; ``frame`` the file name
-    without its suffix.
+    without its suffix; ``columns`` the names of the columns of a file without names, see
+    :func:`lidarsim.scan_files.read_scan`.
     """
 
     drive: str
     frame: str
     path: Path = field(compare=False)
+    columns: tuple[str, ...] = field(default=(), compare=False)
 
     @property
     def name(self) -> str:
@@ -51,22 +54,30 @@ class Scan:
 
     @property
     def cache_key(self) -> ItemKey:
-        """Name, size and time of change of the file."""
+        """Name with the columns if these are given, size and time of change of the file."""
         try:
             about = self.path.stat()
         except OSError as error:
             raise unreadable(self.path, error) from error
-        return self.name, about.st_size, about.st_mtime_ns
+        name = f"{self.name}@{','.join(self.columns)}" if self.columns else self.name
+        return name, about.st_size, about.st_mtime_ns
+
+    def read(self, sensor: LidarSensor | None = None) -> np.ndarray:
+        """Points ``(P, 4)``, see :func:`lidarsim.scan_files.read_scan`."""
+        return read_scan(self.path, sensor, self.columns)
 
 
-def find_scans(source: str | Path | Sequence[str | Path]) -> list[Scan]:
+def find_scans(
+    source: str | Path | Sequence[str | Path], columns: Sequence[str] = ()
+) -> list[Scan]:
     """All scans of a folder (with its sub-folders), file, glob, or list of these, sorted.
 
     In the KITTI-360 layout (a folder that holds ``data_3d_raw``), only the Velodyne scans. Of other
     folders and globs, the ``.bin`` files, or else files of one other format that can be read. Links
     to folders are followed; hidden files are left out. The drive of a scan is its folder relative
-    to the given folder, or to the common parent of a glob or list. ``ValueError`` if nothing is
-    found, one file is named twice, or a name could not be an output file's.
+    to the given folder, or to the common parent of a glob or list. ``columns`` names the columns of
+    files without names. ``ValueError`` if nothing is found, one file is named twice, or a name
+    could not be an output file's.
     """
     given = [source] if isinstance(source, str | Path) else list(source)
     entries = [_without_dots(Path(entry).absolute()) for entry in given]
@@ -82,7 +93,9 @@ def find_scans(source: str | Path | Sequence[str | Path]) -> list[Scan]:
         raise ValueError(f"scans given twice: {', '.join(twice[:5])}; name every file once")
     parent = os.path.commonpath([file.parent for file in files])
     root = entries[0] if single else Path(parent)
-    scans = sorted(Scan(_drive_name(file.parent, root), file.stem, file) for file in files)
+    scans = sorted(
+        Scan(_drive_name(file.parent, root), file.stem, file, tuple(columns)) for file in files
+    )
     for scan in scans:  # they become names of reconstructions and of feature grids
         if reason := refuse_name(scan.name):
             raise ValueError(f"{scan.path}: the name of the scan {reason}; rename the file")
@@ -184,7 +197,7 @@ def check(path: str | Path) -> tuple[str, bool]:
 
     def examine(scan: Scan) -> tuple[float, float] | str:
         try:
-            intensity = read_scan(scan.path, sensor)[:, 3]
+            intensity = scan.read(sensor)[:, 3]
         except ScanError as error:
             return f"bad: {error}"
         return float(intensity.min()), float(intensity.max())
@@ -198,7 +211,10 @@ def check(path: str | Path) -> tuple[str, bool]:
         outside = " (expected 0..1)" if low < 0 or high > 1 else ""
         lines.append(f"intensity: {low:.3g}..{high:.3g}{outside}")
     verdict = f"problems: {len(problems)}" if problems else "all usable"
-    lines.append(f"{root}: {len(scans)} scans in {len(counts)} drives, {verdict}")
+    scans_text = f"{len(scans)} scan{'s' * (len(scans) != 1)}"
+    lines.append(
+        f"{root}: {scans_text} in {len(counts)} drive{'s' * (len(counts) != 1)}, {verdict}"
+    )
     return "\n".join(lines), not problems
 
 

@@ -17,7 +17,6 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from lidarsim.scan_files import read_scan
 from r3dpa.data.datasets import CachedImages, points_at_pixels
 from r3dpa.data.feature_grids import Extractor
 from r3dpa.data.labels import CLASS_NAMES, read_labels
@@ -234,7 +233,7 @@ def _labelled_points(
 ) -> tuple[Tensor, Tensor]:
     """Points ``(P, 4)`` of a scan, and KITTI-360 class ids ``(P,)``."""
     if images is None:
-        points = torch.from_numpy(read_scan(scan.path, sensor))
+        points = torch.from_numpy(scan.read(sensor))
         return points, torch.from_numpy(read_labels(scan.path, len(points))) & 0xFFFF
     pixels = images.read(scan)
     if pixels.classes is None:

@@ -1,0 +1,63 @@
+"""What `fit --dry_run` prints of a training, and that it writes nothing."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from r3dpa.bench.dry_run import batch_lines
+from r3dpa.cli import main
+
+
+def dry_run(words, capsys):
+    main([*words, "--dry_run"])
+    return dict(line.partition(": ")[::2] for line in capsys.readouterr().out.splitlines())
+
+
+def test_a_dry_run_measures_a_step_and_writes_nothing(smoke_args, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = smoke_args("vae_alignment", tmp_path / "run", "--trainer.accumulate_grad_batches=2")
+    lines = dry_run([*words, "--trainer.max_steps=100000000"], capsys)
+    assert lines["global batch"] == "4 = 2 per process x 1 processes x 2 accumulated"
+    assert lines["steps"] == "100,000,000"
+    assert "s per step of 4 scans in each process" in lines["time"]
+    assert " s per step of 1, in " in lines["measured"]
+    assert "years on this machine" in lines["warning"] or "days on this" in lines["warning"]
+    assert lines["memory"].endswith("of the process with 1 scan per step, more with 4")
+    assert lines["disk"].startswith("feature grids of 512 bytes per scan, 6.14 kB")  # 2 x 8 x 16
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_dry_run_of_checkpoints(smoke_args, tmp_path, vae_checkpoint, capsys):
+    """Beside the weights of a checkpoint lie both moments of those that are trained."""
+    words = smoke_args("vae_alignment", tmp_path / "run")
+    main([*words, "--dry_run"])
+    (line,) = (x for x in capsys.readouterr().out.splitlines() if "checkpoints of" in x)
+    megabytes = float(line.partition("2 checkpoints of ")[2].split()[0])
+    assert megabytes == pytest.approx(vae_checkpoint.stat().st_size / 1e6, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("processes", "batch_size", "warning"),
+    [
+        (4, 8, ""),
+        (8, 8, ": give --data.init_args.batch_size 4"),
+        (1, 8, ": give --data.init_args.batch_size 32"),
+        (6, 8, "warning: the paper trains with a global batch of 32"),
+    ],
+)
+def test_another_batch_than_the_papers_is_announced(processes, batch_size, warning):
+    module, trainer = SimpleNamespace(stage="joint"), SimpleNamespace(world_size=processes)
+    trainer.accumulate_grad_batches = 1
+    data = SimpleNamespace(batch_size=batch_size, dataset="KITTI-360")
+    first, *others = batch_lines(module, data, trainer)
+    assert first.startswith(f"global batch: {processes * batch_size} = 8 per process")
+    assert len(others) == bool(warning)
+    assert "".join(others).endswith(warning)
+    data.dataset = None
+    assert batch_lines(module, data, trainer) == [first]
+
+
+def test_a_dry_run_is_of_a_fit(capsys):
+    with pytest.raises(SystemExit):
+        main(["validate", "joint", "--dry_run"])
+    assert "--dry_run is an option of r3dpa fit" in capsys.readouterr().err
