@@ -13,7 +13,7 @@ from r3dpa.data import (
     check,
     write_bin,
 )
-from r3dpa.data.datamodules import default_features_dir
+from r3dpa.data.feature_grids import default_features_dir
 from r3dpa.data.scans import KITTI360_DRIVES
 from r3dpa.geometry import LidarSensor
 

@@ -202,9 +202,11 @@ def test_real_hdl32e(path):
     estimated = estimate(path)
     degrees = np.degrees(estimated.sensor.lasers.inclination_rad)
     np.testing.assert_allclose(degrees, np.linspace(10.67, -30.67, 32), atol=0.01)
-    # 46.08 us between firings: 2170 columns at 10 turns a second, 1085 at 20.
-    nominal = 2170 if path.is_dir() else 1085
-    assert estimated.sensor.shots == pytest.approx(nominal, rel=0.02)
+    # 46.08 us between firings: 1085 columns at 20 turns a second. The scans of the folder are 400
+    # degrees long, with a step of 0.18 degrees.
+    nominal = 2000 if path.is_dir() else 1085
+    assert estimated.sensor.shots == pytest.approx(nominal, rel=0.005)
+    assert any("400 degrees long" in note for note in estimated.notes) == path.is_dir()
     assert estimated.direction == "clockwise"
 
 

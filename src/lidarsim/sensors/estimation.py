@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from lidarsim.clouds import find_files
 from lidarsim.ground import ground_of
-from lidarsim.sensors.beams import BeamFit, ColumnFit, fit_beams, fit_columns
+from lidarsim.sensors.beams import MORE_THAN_A_TURN, BeamFit, ColumnFit, fit_beams, fit_columns
 from lidarsim.sensors.files import SensorFile, write_sensor
 from lidarsim.sensors.recordings import (
     WORKS_STILL,
@@ -178,6 +178,11 @@ def estimate_sensor(scans: Sequence[Any] | str | Path) -> SensorEstimate:
     columns = fit_columns(points.beam, azimuth, distance_m, points.scan)
     if columns.coherence < _COHERENT:
         notes.append("azimuths lie on no common steps: the columns follow from the mean step")
+    if columns.turns > MORE_THAN_A_TURN:
+        notes.append(
+            f"a scan is {360 * columns.turns:.0f} degrees long: directions that it sees twice have "
+            "one pixel in an image"
+        )
     direction, head = _rotation(read, points, azimuth)
     num_columns, offset, sure_columns = columns.columns, columns.offset, columns.coherence
     if points.column is not None and head is not None:

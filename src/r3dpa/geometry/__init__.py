@@ -1,6 +1,7 @@
 """Sensor, projections and range images: the one place that maps points to pixels."""
 
 from lidarsim.sensors.view import LidarSensor
+from r3dpa.geometry.beams import BeamProjection
 from r3dpa.geometry.codec import (
     Pixels,
     RangeCodec,
@@ -16,6 +17,7 @@ from r3dpa.geometry.projection import (
     points_of,
     pool_cells,
     range_image,
+    share_kept,
     unproject,
     values_at_returns,
 )
@@ -33,6 +35,7 @@ __all__ = [
     "NUM_CLASSES",
     "SEMANTIC_CLASSES",
     "UNKNOWN_CLASS",
+    "BeamProjection",
     "LidarSensor",
     "Pixels",
     "Projection",
@@ -48,6 +51,7 @@ __all__ = [
     "project_pixels",
     "projection_to_dict",
     "range_image",
+    "share_kept",
     "unproject",
     "values_at_returns",
 ]
