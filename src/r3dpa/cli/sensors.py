@@ -79,6 +79,7 @@ def plan(
     check_folder(out)
     from r3dpa.data.sensor_plan import SensorPlan
 
-    made = SensorPlan.of(sensor, str(scans), minutes, columns, workers)
+    # Plain numbers, which YAML can hold.
+    made = SensorPlan.of(sensor, str(scans), float(minutes), int(columns), int(workers))
     made.write(out)
     return str(made)
