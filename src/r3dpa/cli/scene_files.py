@@ -21,7 +21,7 @@ from r3dpa.cli.parser import SceneOptions
 from r3dpa.data.scans import find_scans
 from r3dpa.data.scene_writer import SceneWriter
 from r3dpa.generation import SceneGenerator
-from r3dpa.geometry import ScanGeometry
+from r3dpa.geometry import BeamProjection, ScanGeometry
 from r3dpa.io import source_commit
 from r3dpa.pretrained import without_features
 
@@ -59,9 +59,16 @@ def provenance(
 
 
 def generate_all(
-    generator: SceneGenerator | BaselineGenerator, writer: SceneWriter, batch_size: int, seed: int
+    generator: SceneGenerator | BaselineGenerator,
+    writer: SceneWriter,
+    batch_size: int,
+    seed: int,
+    seen_by: BeamProjection | None = None,
 ) -> dict[str, Any]:
-    """Generates and writes the missing scenes; returns evaluations and time."""
+    """Generates and writes the missing scenes, as a sensor sees them if one is given.
+
+    Returns evaluations and time.
+    """
     first_index, start = writer.num_done, time.perf_counter()
     with tqdm(
         total=writer.num, initial=first_index, unit="scene", desc="sampling", disable=None
@@ -69,6 +76,8 @@ def generate_all(
         for first in range(first_index, writer.num, batch_size):
             indices = range(first, min(first + batch_size, writer.num))
             batch = generator.generate(indices, seed)
+            if seen_by is not None:
+                batch = batch.seen_by(seen_by)
             writer.put(batch.range_m, batch.nfe, batch.intensity, batch.labels)
             progress.update(len(indices))
     writer.close()

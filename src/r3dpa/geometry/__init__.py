@@ -9,6 +9,7 @@ from r3dpa.geometry.codec import (
     project_pixels,
     projection_to_dict,
 )
+from r3dpa.geometry.other_view import projection_for, values_in, view_of
 from r3dpa.geometry.projection import (
     Projection,
     RingProjection,
@@ -49,9 +50,12 @@ __all__ = [
     "points_of",
     "pool_cells",
     "project_pixels",
+    "projection_for",
     "projection_to_dict",
     "range_image",
     "share_kept",
     "unproject",
     "values_at_returns",
+    "values_in",
+    "view_of",
 ]
