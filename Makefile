@@ -143,7 +143,7 @@ my-sensor: $(READY) ## r3dpa-s in the geometry of your sensor: make my-sensor DA
 	rm -rf '$(MINE)'
 	$(BIN)/r3dpa data sensor '$(DATA)' --out '$(MINE)/sensor.yaml'
 	$(BIN)/r3dpa data plan '$(SENSOR)' --scans '$(DATA)' --out '$(MINE)' --minutes $(MINUTES)
-	$(BIN)/r3dpa data simulate --config '$(MINE)/simulate.yaml'
+	$(BIN)/r3dpa data simulate --out '$(MINE)/simulated' --config '$(MINE)/simulate.yaml'
 	$(MY_FIT) --config conf/r3dpa_s/vae_alignment.yaml --config conf/r3dpa_s/demo_vae.yaml \
 		--config '$(MINE)/vae.yaml' --run_dir '$(MINE)/vae'
 	$(MY_FIT) --config conf/r3dpa_s/flow_matching.yaml --config conf/r3dpa_s/demo_flow.yaml \

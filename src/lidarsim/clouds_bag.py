@@ -34,7 +34,7 @@ def read_bag(path: Path, topic: str | None = None) -> Iterator[tuple[str, PointC
         topic: Topic of the scans; needed if several hold some.
 
     Raises:
-        ScanError: If the file is damaged, or holds no scans or those of several topics.
+        ScanError: If the file is damaged, or its scans have no or several topics.
     """
     try:
         from rosbags.highlevel import AnyReader, AnyReaderError

@@ -143,7 +143,7 @@ def fit_columns(beam: Indices, azimuth: Floats, distance_m: Floats, scan: Indice
         raise ValueError("no beam has neighbouring points, so its columns are unknown")
     usual = float(np.median(ahead))
     turns = _turns(beam, turned, scan)
-    column_rad = usual  # where shots of a second turn lie between those of the first one
+    column_rad = usual  # where shots of a second turn lie between the first ones
     if turns < MORE_THAN_A_TURN:
         column_rad = float(ahead[ahead < _UNBROKEN * usual].mean())
 

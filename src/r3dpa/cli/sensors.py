@@ -80,6 +80,7 @@ def plan(
     from r3dpa.data.sensor_plan import SensorPlan
 
     # Plain numbers, which YAML can hold.
-    made = SensorPlan.of(sensor, str(scans), float(minutes), int(columns), int(workers))
-    made.write(out)
-    return str(made)
+    numbers = (float(minutes), int(columns), int(workers))
+    sensor_plan = SensorPlan.of(sensor, str(scans), *numbers)
+    sensor_plan.write(out)
+    return str(sensor_plan)

@@ -229,7 +229,7 @@ class StageCLI(LightningCLI):
         if isinstance(self.model, GenerativeModule) and self._ckpt_path is None:
             self.model.load_previous_stage()
             option, consequence = _WITHOUT_WEIGHTS.get(self.model.stage, ("", ""))
-            if option and getattr(self.model, option) is None:
+            if option and getattr(self.model, option) is None and self.model.init_from is None:
                 rank_zero_info(f"without --model.init_args.{option} {consequence}")
         self._say_global_batch()
         for callback in cast(Any, self.trainer).callbacks:

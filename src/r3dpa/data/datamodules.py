@@ -82,7 +82,7 @@ class LidarDataModule(LoaderModule):
         val_every: Hold out every n-th scan; None for no validation split. Neighbours in a recording
             look alike: hold out whole recordings by ``val_drives`` for an honest score.
         val_drives: Folders, relative to the root, that are held out whole; replaces ``val_every``.
-        further_scans: Scans to train on beside those of ``scans``, such as simulated ones; none of
+        further_scans: Scans to train on beside ``scans``, such as simulated ones; none of
             them is held out. Folder, file or glob.
         repeats: How often a training scan of ``scans`` occurs per epoch beside ``further_scans``.
         limit: Maximum scans per split, evenly spaced.

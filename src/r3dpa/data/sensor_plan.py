@@ -85,12 +85,12 @@ class SensorPlan:
         lidar = load_sensor(sensor)
         projection = BeamProjection.for_networks(lidar, columns)
         module = LidarDataModule(scans, sensor=sensor, columns=columns, val_every=None)
-        found = module.split()[0]
-        split = split_of(len(found), scans)
+        all_scans = module.split()[0]
+        split = split_of(len(all_scans), scans)
         seconds = _seconds_per_scan(lidar)
         fitting = int(60 * _SIMULATION_SHARE * minutes * workers / seconds)
         num_simulated = min(MOST_SIMULATED, max(FEWEST_SIMULATED, fitting))
-        kept = _mean_share_kept(evenly(found, _MOST_CHECKED), projection)
+        kept = _mean_share_kept(evenly(all_scans, _MOST_CHECKED), projection)
         return cls(sensor, scans, projection, split, kept, seconds, num_simulated, minutes, workers)
 
     @property
@@ -129,7 +129,6 @@ class SensorPlan:
             "flow": self._stage(_FLOW_STEPS, _FLOW_SHARE, {})
             | {"data": {"init_args": {"augmentation": {"rotate": True}}}},
             "simulate": {
-                "out": str(out / "simulated"),
                 "scans": self.num_simulated,
                 "sensor": self.sensor,
                 "every": _EVERY,
@@ -174,19 +173,22 @@ class SensorPlan:
             [
                 f"image: {sensor.beams} x {sensor.columns}, {reach}, one row per beam; "
                 f"it holds {self.kept:.1%} of the points of a scan",
-                f"scans: {split.num_train} to train on, {split.num_held_out} held out (every "
-                f"{split.val_every}th)",
+                f"scans: {split.num_train} to train on, {split.num_held_out} held out",
                 simulated,
-                f"steps: {self.steps(_VAE_STEPS)} of the VAE, {self.steps(_FLOW_STEPS)} of the SiT",
+                f"{self._steps_text}, fewer where the time ends before",
             ]
         )
+
+    @property
+    def _steps_text(self) -> str:
+        return f"{self.steps(_VAE_STEPS)} steps of the VAE, {self.steps(_FLOW_STEPS)} of the SiT"
 
     @property
     def more(self) -> str:
         """What an hour or a GPU would add."""
         return (
-            f"This was {self.minutes:g} minutes: {self.num_simulated} simulated scans, "
-            f"{self.steps(_VAE_STEPS)} steps of the VAE and {self.steps(_FLOW_STEPS)} of the SiT.\n"
+            f"Planned for {self.minutes:g} minutes on two idle cores: {self.num_simulated} scans, "
+            f"{self._steps_text}; a slower machine stops a stage before its last step.\n"
             "make my-sensor MINUTES=60 takes six times as many steps as ten minutes, and up to "
             f"{MOST_SIMULATED} scans.\n"
             "A GPU takes the steps that r3dpa-s was trained with in about an hour: 5252 of 64 "
