@@ -41,6 +41,18 @@ def test_a_plane_stays_a_plane():
     assert target.sensor.range_max_m == 56.0
 
 
+def test_rows_that_no_beam_met_are_filled_but_not_single_losses():
+    image = ground(MODEL).clone()
+    image[:, 40] = -1
+    image[:, 30, 100] = -1
+    range_m, _ = view_of(image, MODEL, projection_for("hdl64e", MODEL))
+    whole, _ = view_of(ground(MODEL), MODEL, projection_for("hdl64e", MODEL))
+    lost = ((range_m < 0) & (whole > 0)).sum()
+    assert 1 <= lost <= 2
+    range_m, whole = range_m[..., :90], whole[..., :90]  # beside the loss, rows are not blended
+    torch.testing.assert_close(range_m, whole, rtol=0.01, atol=0)
+
+
 def test_values_come_from_the_nearest_pixel():
     target = projection_for(some_beams(4), MODEL)
     image = ground(MODEL)

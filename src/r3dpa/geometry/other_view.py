@@ -17,7 +17,7 @@ from lidarsim.sensors.files import load_sensor
 from lidarsim.sensors.spinning import SpinningLidar
 from lidarsim.sensors.view import LidarSensor
 from r3dpa.geometry.beams import BeamProjection
-from r3dpa.geometry.projection import Projection, unproject
+from r3dpa.geometry.projection import Projection, SphericalProjection, unproject
 from r3dpa.geometry.sensor import EMPTY_RANGE_M, angles_of, column_of
 
 _DENSER = 1.1  # beams per degree of two sensors that count as alike
@@ -81,14 +81,17 @@ def view_of(range_m: Tensor, source: Projection, target: BeamProjection) -> tupl
     """Range images ``(B, H, W)`` along the beams of ``target``, and where they were read.
 
     Between two rows of one surface, the inverse of the range is interpolated, which is exact on
-    planes; elsewhere the nearer row counts. A beam starts at its own optical centre, so the
-    direction in which an image is read depends on the range.
+    planes; elsewhere the nearer row counts. Rows of equal pitch that meet no beam of the sensor
+    that a model learned from are filled from above and below. A beam starts at its own optical
+    centre, so the direction in which an image is read depends on the range.
 
     Args:
         range_m: ``(B, H', W')`` metres, not positive without a return.
         source: Projection of these images.
         target: Projection of :func:`projection_for`.
     """
+    if isinstance(source, SphericalProjection):
+        range_m = _fill_missed_rows(range_m)
     size = (len(range_m), target.sensor.beams, target.sensor.columns)
     seen = torch.full(size, _FIRST_GUESS_M, dtype=range_m.dtype, device=range_m.device)
     for _ in range(_ROUNDS):
@@ -119,14 +122,28 @@ def _read_at(points: Tensor, source: Projection) -> View:
     return View(above, below, share.clamp(0, 1).to(points.dtype), column)
 
 
+def _fill_missed_rows(range_m: Tensor) -> Tensor:
+    """Fill pixels between two of one surface, in rows that are empty to both sides as well."""
+    above, below = range_m.roll(1, dims=-2), range_m.roll(-1, dims=-2)
+    is_empty = range_m <= 0
+    is_missed = is_empty & is_empty.roll(1, dims=-1) & is_empty.roll(-1, dims=-1)
+    is_missed &= (above > 0) & (below > 0) & _on_one_surface(above, below)
+    is_missed[..., [0, -1], :] = False
+    return torch.where(is_missed, 2 / (1 / above + 1 / below), range_m)
+
+
+def _on_one_surface(first: Tensor, second: Tensor) -> Tensor:
+    nearer = torch.minimum(first, second).clamp(min=1e-6)
+    return torch.maximum(first, second) / nearer < _SAME_SURFACE
+
+
 def _interpolated(range_m: Tensor, view: View) -> Tensor:
     batch = torch.arange(len(range_m), device=range_m.device)[:, None, None]
     above, below = range_m[batch, view.above, view.column], range_m[batch, view.below, view.column]
     nearer = torch.where(view.share < 0.5, above, below)
     both = (above > 0) & (below > 0)
-    ratio = torch.maximum(above, below) / torch.minimum(above, below).clamp(min=1e-6)
     between = 1 / torch.lerp(1 / above.clamp(min=1e-6), 1 / below.clamp(min=1e-6), view.share)
-    return torch.where(both & (ratio < _SAME_SURFACE), between, nearer)
+    return torch.where(both & _on_one_surface(above, below), between, nearer)
 
 
 def _inside(range_m: Tensor, sensor: LidarSensor) -> Tensor:
