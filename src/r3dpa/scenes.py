@@ -179,11 +179,13 @@ class SceneBatch:
                 more than the images show.
         """
         range_m, view = view_of(self.range_m, self.projection, projection)
-        others = {
-            name: None if values is None else values_in(values, view, range_m)
-            for name, values in (("intensity", self.intensity), ("labels", self.labels))
-        }
-        return replace(self, range_m=range_m, projection=projection, **others)
+        intensity, labels = (
+            None if values is None else values_in(values, view, range_m)
+            for values in (self.intensity, self.labels)
+        )
+        return replace(
+            self, range_m=range_m, projection=projection, intensity=intensity, labels=labels
+        )
 
     def __repr__(self) -> str:
         about = _describe(self.range_m, self.intensity, self.labels)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import cast
 
 import torch.nn.functional as F
 from einops import rearrange
@@ -80,7 +81,8 @@ def _sit_of_size(state: NetworkState, sit: SiT) -> tuple[NetworkState, dict[str,
 
 
 def _vae_of_size(state: NetworkState, vae: VAE) -> tuple[NetworkState, dict[str, Tensor]]:
-    given, wanted = tuple(state.arguments["stem"]), vae.encoder.stem
+    given: Size = tuple(state.arguments["stem"])
+    wanted = cast(Size, vae.encoder.stem)  # a module's attribute has no type
     if given == wanted or math.prod(given) == 1 or math.prod(wanted) == 1:
         return state, {}  # a stem of single pixels has kernels of its own
     weights = state.state_dict

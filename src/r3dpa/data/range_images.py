@@ -228,7 +228,7 @@ class SimulatedImageDataModule(LidarDataModule):
         images = CachedPixels(CachedTensors(self._store, missing), self.sensor.range_max_m)
         dataset = _CachedPoints(missing, images, self.sensor, extractor.prepare)
         loader = plain_loader(dataset, 1, self.num_workers, collate_fn=list)
-        projection = SphericalProjection(self.sensor)
+        projection = self._known_projection
         with grids.writer() as writer:
             for samples in tqdm(loader, desc="feature grids", unit="scan", disable=None):
                 pooled = pooled_grids(extractor, samples, projection, [self.grid_size])

@@ -70,11 +70,12 @@ def projection_for(model: str | Path | SpinningLidar, source: Projection) -> Bea
         )
     projection = BeamProjection.of(lidar, min(sensor.columns, lidar.shots))
     view = projection.sensor
-    limits = {
-        "range_min_m": max(view.range_min_m, sensor.range_min_m),
-        "range_max_m": min(view.range_max_m, sensor.range_max_m),
-    }
-    return replace(projection, sensor=replace(view, **limits))
+    limited = replace(
+        view,
+        range_min_m=max(view.range_min_m, sensor.range_min_m),
+        range_max_m=min(view.range_max_m, sensor.range_max_m),
+    )
+    return replace(projection, sensor=limited)
 
 
 def view_of(range_m: Tensor, source: Projection, target: BeamProjection) -> tuple[Tensor, View]:
