@@ -45,7 +45,7 @@ FIT_FIRST := nice -n 19 $(BIN)/r3dpa fit --config conf/trainer.yaml --config con
 
 .DEFAULT_GOAL := help
 .PHONY: help install format lint types test test-lowest test-all test-numerics \
-	test-faults test-nodes fuzz notebooks demo gallery r3dpa-s \
+	test-faults test-nodes fuzz notebooks demo my-sensor gallery r3dpa-s \
 	r3dpa-s-control r3dpa-s-first r3dpa-s-scores docs clean bench bench-training \
 	bench-sampling bench-gpu ablations
 
@@ -132,6 +132,31 @@ demo: $(READY)
 	$(BIN)/r3dpa evaluate --samples '$(OUT)/scenes' --reference '$(OUT)/reference.safetensors' \
 		--allow_few --label after --beside '$(OUT)/before/evaluation.json' --out '$(OUT)/after'
 endif
+
+# MINUTES of simulation and training on two cores. SENSOR: a preset or YAML, in place of an estimate.
+MINUTES ?= 10
+SENSOR ?= $(MINE)/sensor.yaml
+MINE := runs/my_sensor
+MY_FIT := $(BIN)/r3dpa fit --config conf/trainer.yaml --config conf/r3dpa_s/trainer.yaml \
+	--config '$(MINE)/data.yaml'
+my-sensor: $(READY) ## r3dpa-s in the geometry of your sensor: make my-sensor DATA=folder of scans [MINUTES=60]
+	rm -rf '$(MINE)'
+	$(BIN)/r3dpa data sensor '$(DATA)' --out '$(MINE)/sensor.yaml'
+	$(BIN)/r3dpa data plan '$(SENSOR)' --scans '$(DATA)' --out '$(MINE)' --minutes $(MINUTES)
+	$(BIN)/r3dpa data simulate --out '$(MINE)/simulated' --config '$(MINE)/simulate.yaml'
+	$(MY_FIT) --config conf/r3dpa_s/vae_alignment.yaml --config conf/r3dpa_s/demo_vae.yaml \
+		--config '$(MINE)/vae.yaml' --run_dir '$(MINE)/vae'
+	$(MY_FIT) --config conf/r3dpa_s/flow_matching.yaml --config conf/r3dpa_s/demo_flow.yaml \
+		--config '$(MINE)/flow.yaml' --run_dir '$(MINE)/flow' \
+		--model.init_args.init_from '$(MINE)/vae/checkpoints/last.ckpt'
+	$(BIN)/r3dpa data reference --data '$(MINE)/data.yaml' --split val --out '$(MINE)/reference.safetensors'
+	$(BIN)/r3dpa sample --out '$(MINE)/r3dpa-s'
+	$(BIN)/r3dpa sample --ckpt '$(MINE)/flow/checkpoints/last.ckpt' --out '$(MINE)/scenes'
+	$(BIN)/r3dpa evaluate --samples '$(MINE)/r3dpa-s' --reference '$(MINE)/reference.safetensors' \
+		--allow_few --label before --out '$(MINE)/before'
+	$(BIN)/r3dpa evaluate --samples '$(MINE)/scenes' --reference '$(MINE)/reference.safetensors' \
+		--allow_few --label after --beside '$(MINE)/before/evaluation.json' --out '$(MINE)/after'
+	@cat '$(MINE)/more.txt'
 
 gallery: $(READY) ## one page of 64 scenes in order, their nearest training scans, edits, weather
 	$(BIN)/r3dpa gallery --out runs/gallery.html $(if $(wildcard runs/r3dpa_s/data),--data conf/r3dpa_s/data.yaml)

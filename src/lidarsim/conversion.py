@@ -8,6 +8,7 @@ from typing import Literal
 
 from lidarsim.cloud_formats import ScanError
 from lidarsim.clouds import WRITERS, PointCloud, find_files, read_cloud, suffix_of
+from lidarsim.clouds_bag import is_bag, read_bag
 from lidarsim.io import atomic_path
 from lidarsim.rings import rings_of
 from lidarsim.weather import recorded_scan
@@ -24,6 +25,7 @@ def convert(
     columns: Sequence[str] = (),
     drop_nan: bool = False,
     full_intensity: float | None = None,
+    topic: str | None = None,
 ) -> str:
     """Write scans in another format, with the labels beside them.
 
@@ -31,13 +33,14 @@ def convert(
     255 and the ring. Other formats keep units and all columns. ``las`` needs the package laspy.
 
     Args:
-        source: Scan, or folder of scans of any format that can be read.
+        source: Scan, or folder of scans of any format that can be read; or a ROS bag or MCAP file.
         out: File for a single scan, or folder, in which scans keep their names.
         to: Format; default: by the suffix of ``out``.
         columns: Columns of files without names, such as ``x,y,z,intensity,ring,time``; default: by
             the values.
         drop_nan: Leave out points with NaN.
         full_intensity: Intensity of the full scale; default: 1, or 255 above that.
+        topic: Topic of the scans of a bag; needed if several hold some.
 
     Raises:
         ScanError: If a scan cannot be read or written, or its file exists.
@@ -46,6 +49,8 @@ def convert(
     if suffix not in WRITERS:
         choices = ", ".join(name.removeprefix(".") for name in WRITERS)
         raise ValueError(f"{out}: unknown format {suffix!r}; choose --to from {choices}")
+    if is_bag(source):
+        return _convert_bag(source, out, suffix, topic, full_intensity)
     root, files = find_files(source)
     is_file = source.is_file() and suffix_of(out) == suffix
     targets: dict[Path, Path] = {}
@@ -59,10 +64,7 @@ def convert(
         targets[target] = path
     for target, path in targets.items():
         cloud = read_cloud(path, columns, drop_nan)
-        cloud.check_metres()
-        if suffix == ".pcd.bin" and cloud.ring is None:
-            cloud = with_rings(cloud)
-        contents = {target: WRITERS[suffix](cloud, full_intensity)}
+        contents = {target: _content(cloud, suffix, full_intensity)}
         if cloud.labels is not None:
             labels = target.with_name(f"{_stem(target)}.label")
             contents[labels] = cloud.labels.astype("<u4").tobytes()
@@ -70,6 +72,29 @@ def convert(
             with atomic_path(written) as temporary:
                 temporary.write_bytes(content)
     return f"{len(targets)} scans written to {out} as {suffix}"
+
+
+def _convert_bag(
+    source: Path, out: Path, suffix: str, topic: str | None, full_intensity: float | None
+) -> str:
+    """Write the scans of a bag, numbered in the order of recording, into a folder."""
+    num_written = 0
+    for name, cloud in read_bag(source, topic):
+        target = out / f"{name}{suffix}"
+        if target.exists():
+            raise ScanError(f"{target}: exists: delete it, or give another folder")
+        content = _content(cloud, suffix, full_intensity)
+        with atomic_path(target) as temporary:
+            temporary.write_bytes(content)
+        num_written += 1
+    return f"{num_written} scans written to {out} as {suffix}"
+
+
+def _content(cloud: PointCloud, suffix: str, full_intensity: float | None) -> bytes:
+    cloud.check_metres()
+    if suffix == ".pcd.bin" and cloud.ring is None:
+        cloud = with_rings(cloud)
+    return WRITERS[suffix](cloud, full_intensity)
 
 
 def with_rings(cloud: PointCloud) -> PointCloud:

@@ -38,7 +38,8 @@ _CLASSES = "classes.yaml"  # names of the class ids of the labels
 SIMULATOR_VERSION = 4
 # Neighbouring scans share their blocks of street, so a worker takes a few in a row.
 _SCANS_PER_TASK = 8
-_Task = tuple[DriveFiles, Simulator, list[int]]  # numbers of the scans of one drive
+# Numbers of the scans of one drive, and their stride.
+_Task = tuple[DriveFiles, Simulator, list[int], int]
 
 
 class EffectTotal(NamedTuple):
@@ -93,6 +94,7 @@ def simulate(
     return_mode: Literal["strongest", "dual"] | None = None,
     effects: Mapping[str, str | bool] | None = None,
     weather: Conditions | None = None,
+    every: int = 1,
 ) -> SimulationReport:
     """Write a simulated data set in the layout of KITTI-360, complete one, or add scans to one.
 
@@ -116,6 +118,8 @@ def simulate(
         effects: ``off`` or ``auto`` by effect, such as ``--effects.fog off``; default: ``auto``.
         weather: Weather of all scans, such as ``--weather.rain_mm_h 10``; default: drawn for each
             stretch of street.
+        every: Stride in scans of a drive, which are 0.1 s apart: 40 sees more street, but has more
+            of it to build.
 
     Returns:
         Contents of the data set by effect, also written to ``report.json``.
@@ -125,8 +129,9 @@ def simulate(
             twice, or ``out`` holds other data or the data set of another request.
         ChildProcessError: If a worker was killed.
     """
-    if workers < 1:
-        raise ValueError(f"workers must be 1 or greater, got {workers}")
+    for name, value in (("workers", workers), ("every", every)):
+        if value < 1:
+            raise ValueError(f"{name} must be 1 or greater, got {value}")
     if isinstance(sensor, str):
         sensor = load_sensor(sensor)
     if return_mode is not None:
@@ -143,6 +148,8 @@ def simulate(
         "effects": check_switches(effects or {}),
         "weather": None if weather is None else weather_to_dict(weather),
     }
+    if every > 1:
+        request["every"] = every
     holds_more = _check_folder(out, request)
     files = {DriveFiles(out, drive): count for drive, count in counts.items()}
     read_only = out.is_dir() and not os.access(out, os.W_OK)
@@ -163,8 +170,9 @@ def simulate(
             missing = drive.missing(count)
             simulator = simulators[drive.drive]
             for start in range(0, len(missing), _SCANS_PER_TASK):
-                tasks.append((drive, simulator, missing[start : start + _SCANS_PER_TASK]))
-        num_missing = sum(len(numbers) for *_, numbers in tasks)
+                numbers = missing[start : start + _SCANS_PER_TASK]
+                tasks.append((drive, simulator, numbers, every))
+        num_missing = sum(len(numbers) for _, _, numbers, _ in tasks)
         complete = scans - num_missing
         # disable=None: no bar without a terminal.
         with tqdm(total=scans, initial=complete, unit="scan", desc="simulate", disable=None) as bar:
@@ -256,9 +264,9 @@ def _read_json(path: Path) -> dict[str, Any]:
 
 
 def _run(task: _Task) -> int:
-    files, simulator, numbers = task
+    files, simulator, numbers, every = task
     for number in numbers:
-        files.write_scan(number, simulator.scan(number))
+        files.write_scan(number, simulator.scan(number * every))
     return len(numbers)
 
 

@@ -7,6 +7,8 @@ from typing import Any
 
 #: Old module or class, and the new one; the longest one that fits counts.
 MOVED = {
+    "r3dpa.data.datamodules.LabelledPointDataModule": "r3dpa.data.LabelledPointDataModule",
+    "r3dpa.data.datamodules.PointDataModule": "r3dpa.data.PointDataModule",
     "r3dpa.data.objects": "r3dpa.editing.objects",
     "r3dpa.flow.diffusion": "r3dpa.baselines.diffusion_paths",
     "r3dpa.geometry.scan_geometry": "r3dpa.geometry.codec",

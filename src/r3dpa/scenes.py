@@ -20,6 +20,7 @@ from torch import Tensor
 from lidarsim.clouds import PointCloud, read_cloud
 from r3dpa.geometry import (
     SEMANTIC_CLASSES,
+    BeamProjection,
     Pixels,
     Projection,
     classes_of,
@@ -28,6 +29,8 @@ from r3dpa.geometry import (
     points_of,
     project_pixels,
     values_at_returns,
+    values_in,
+    view_of,
 )
 
 _PICTURES, _PAGES = 4, 8  # scenes that a notebook cell shows
@@ -167,6 +170,22 @@ class SceneBatch:
         """Scenes of decoded pixels ``(B, H, W)``."""
         labels = None if pixels.classes is None else labels_of(pixels.classes)
         return cls(pixels.range_m, latents, nfe, projection, pixels.intensity, labels)
+
+    def seen_by(self, projection: BeamProjection) -> Self:
+        """The scenes along the beams of another sensor.
+
+        Args:
+            projection: Of :func:`r3dpa.geometry.projection_for`, which refuses sensors that see
+                more than the images show.
+        """
+        range_m, view = view_of(self.range_m, self.projection, projection)
+        intensity, labels = (
+            None if values is None else values_in(values, view, range_m)
+            for values in (self.intensity, self.labels)
+        )
+        return replace(
+            self, range_m=range_m, projection=projection, intensity=intensity, labels=labels
+        )
 
     def __repr__(self) -> str:
         about = _describe(self.range_m, self.intensity, self.labels)

@@ -14,8 +14,7 @@ import yaml
 
 from r3dpa.cli import main
 from r3dpa.data import FeatureGrids, LidarDataModule, find_scans
-from r3dpa.data.datamodules import default_features_dir
-from r3dpa.data.feature_grids import any_settings
+from r3dpa.data.feature_grids import any_settings, default_features_dir
 from r3dpa.features import WaffleIron
 from r3dpa.features.scalr import official_name
 from r3dpa.geometry import LidarSensor, SphericalProjection

@@ -228,6 +228,25 @@ class TestSample:
         assert len(list(tmp_path.iterdir())) == 2
 
 
+def test_scenes_in_the_geometry_of_another_sensor(tiny_file, tmp_path, capsys):
+    beams = {"inclination_deg": [1.0, -3.0, -7.0, -11.0, -15.0, -19.0]}
+    path = tmp_path / "six.yaml"
+    path.write_text(json.dumps({"sensor": {"shots": 48, "max_range_m": 40.0}, "lasers": beams}))
+    metadata = sample(tiny_file, tmp_path / "six", "--sensor", path)
+    seen = metadata["geometry"]["projection"]["sensor"]
+    assert (seen["beams"], seen["columns"], seen["range_max_m"]) == (6, 48, 40.0)
+    assert np.load(tmp_path / "six" / "range_m.npy").shape == (3, 6, 48)
+    assert f"as seen by {path}: 6 x 48, up to 40 m" in capsys.readouterr().out
+    for points in values(tmp_path / "six").values():
+        degrees = np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
+        off = np.abs(degrees[:, None] - np.array(beams["inclination_deg"])).min(axis=1)
+        assert len(points)
+        assert off.max() < 1e-3
+    with pytest.raises(ValueError, match="hdl32e looks from"):
+        sample(tiny_file, tmp_path / "refused", "--sensor", "hdl32e")
+    assert not (tmp_path / "refused").exists()
+
+
 def test_an_exported_training_gives_the_same_scenes(joint_checkpoint, tmp_path, capsys):
     exported = tmp_path / "joint.safetensors"
     exported.touch()

@@ -1,3 +1,4 @@
+import math
 from itertools import chain
 from pathlib import Path
 
@@ -5,6 +6,7 @@ import pytest
 import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 
+from lidarsim import Simulator
 from r3dpa.data import (
     KITTI360DataModule,
     LidarDataModule,
@@ -13,9 +15,9 @@ from r3dpa.data import (
     check,
     write_bin,
 )
-from r3dpa.data.datamodules import default_features_dir
+from r3dpa.data.feature_grids import default_features_dir
 from r3dpa.data.scans import KITTI360_DRIVES
-from r3dpa.geometry import LidarSensor
+from r3dpa.geometry import BeamProjection, LidarSensor, RangeCodec, SphericalProjection
 
 
 # 10 training scans and batches of 2: an epoch has 5 batches. Stops: within the first epoch, at its
@@ -251,3 +253,52 @@ def test_simulated_data_are_made_once_and_feed_a_fit(tmp_path, scaled_points, fi
     smaller.prepare_data()
     smaller.setup("fit")
     assert [len(smaller.train_set), len(smaller.val_set)] == [1, 1]
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    """Scans of a VLP-16 in two folders."""
+    root = tmp_path_factory.mktemp("vlp16")
+    for folder, num_scans in (("own", 4), ("simulated", 3)):
+        for number in range(num_scans):
+            points = Simulator(seed=num_scans, sensor="vlp16").scan(number).points
+            write_bin(root / folder / f"{number}.bin", points)
+    return root
+
+
+class TestNamedSensors:
+    def test_a_preset_gives_a_row_per_beam_and_its_range(self, folders):
+        codec = RangeCodec("log2", return_channel=True)
+        module = LidarDataModule(
+            str(folders / "own"), sensor="vlp16", image_columns=512, codec=codec
+        )
+        module.setup("fit")
+        assert module.projection == BeamProjection.of("vlp16", 512)
+        assert module.geometry.codec.scale == pytest.approx(math.log2(101), abs=1e-4)
+        image = module.train_set[0]["range_image"]
+        assert image.shape == (2, 16, 512)
+        assert (image[1] > 0).any(dim=1).sum() >= 15
+
+    def test_further_scans_are_trained_on_and_never_held_out(self, folders):
+        module = LidarDataModule(
+            str(folders / "own"),
+            sensor="vlp16",
+            val_every=2,
+            further_scans=str(folders / "simulated"),
+            repeats=3,
+        )
+        train, val = module.split()
+        assert len(train) == 3 * 2 + 3
+        assert {scan.path.parent.name for scan in val} == {"own"}
+        assert not {scan.path for scan in train} & {scan.path for scan in val}
+
+    def test_settings_of_an_image_keep_their_projection_and_codec(self, folders):
+        module = LidarDataModule(str(folders / "own"), sensor=LidarSensor(16, 512))
+        module.setup("fit")
+        assert module.projection == SphericalProjection(LidarSensor(16, 512))
+        assert module.codec == RangeCodec()
+
+    @pytest.mark.parametrize("options", [{"image_columns": 512}, {"projection": "beams"}])
+    def test_beams_need_a_named_sensor(self, options):
+        with pytest.raises(ValueError, match="need a sensor given as a preset"):
+            LidarDataModule("scans", sensor=LidarSensor(), **options)

@@ -66,7 +66,7 @@ def test_images_of_another_request_are_not_mixed_up(root):
 
 
 def test_rings_need_points(tmp_path):
-    with pytest.raises(ValueError, match="projection must be spherical"):
+    with pytest.raises(ValueError, match="projection must not be rings"):
         module(tmp_path, projection="rings")
 
 

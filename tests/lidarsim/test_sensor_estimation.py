@@ -160,6 +160,28 @@ def test_what_is_odd_about_scans_is_said(vlp16_scans):
     assert shifted.mount.height_m == pytest.approx(1.73, abs=0.05)
 
 
+def test_scans_compensated_for_motion_are_said_to_be(vlp16_scans):
+    rows = vlp16_scans[0].copy()
+    turn = np.arctan2(rows[:, 1], rows[:, 0]) / (2 * np.pi)
+    rows[:, 0] += turn  # 10 m/s
+    rows[:, 2] += 0.1 * turn
+    smeared = estimate([rows])
+    assert smeared.sensor.num_beams == 16
+    assert any("as in scans compensated for motion" in note for note in smeared.notes)
+
+
+def test_unknown_fields_of_packed_rows_do_no_harm(vlp16_scans, tmp_path):
+    names = ["x", "y", "z", "_", "intensity", "echo", "near_ir"]
+    packed = np.zeros(
+        len(vlp16_scans[0]),
+        np.dtype({"names": names, "formats": ["<f4"] * 4 + ["<u2", "u1", "<u2"]}),
+    )
+    for name, column in zip("xyz", vlp16_scans[0].T[:3], strict=True):
+        packed[name] = column
+    np.save(tmp_path / "packed.npy", packed)
+    assert estimate(tmp_path / "packed.npy").sensor.num_beams == 16
+
+
 def test_scans_that_show_no_spinning_sensor_are_refused(vlp16_scans):
     rows, generator = vlp16_scans[0], np.random.default_rng(2)
     with pytest.raises(ValueError, match="10 of at least 16 points"):
@@ -173,6 +195,9 @@ def test_scans_that_show_no_spinning_sensor_are_refused(vlp16_scans):
     down = rows * np.float32([1, -1, -1, 1])
     with pytest.raises(ValueError, match="above the sensor: turn the points so that z points up"):
         estimate([down])
+    camera = np.stack([-rows[:, 1], -rows[:, 2], rows[:, 0], rows[:, 3]], axis=1)
+    with pytest.raises(ValueError, match="flattest along y: turn the points so that z points up"):
+        estimate([camera])
     # Directions anywhere in a cone, as of a non-repetitive scanner.
     spread = generator.uniform(-0.5, 0.5, (20000, 2))
     away = generator.uniform(3, 40, 20000)
@@ -202,9 +227,11 @@ def test_real_hdl32e(path):
     estimated = estimate(path)
     degrees = np.degrees(estimated.sensor.lasers.inclination_rad)
     np.testing.assert_allclose(degrees, np.linspace(10.67, -30.67, 32), atol=0.01)
-    # 46.08 us between firings: 2170 columns at 10 turns a second, 1085 at 20.
-    nominal = 2170 if path.is_dir() else 1085
-    assert estimated.sensor.shots == pytest.approx(nominal, rel=0.02)
+    # 46.08 us between firings: 1085 columns at 20 turns a second. The scans of the folder are 400
+    # degrees long, with a step of 0.18 degrees.
+    nominal = 2000 if path.is_dir() else 1085
+    assert estimated.sensor.shots == pytest.approx(nominal, rel=0.005)
+    assert any("400 degrees long" in note for note in estimated.notes) == path.is_dir()
     assert estimated.direction == "clockwise"
 
 

@@ -25,6 +25,7 @@ _LEAST_SCALE_RAD = 1e-6  # of float32 coordinates
 _SURE_HEIGHT_M = 0.02  # heights of larger standard error are interpolated
 _MOST_LATERAL_M = 0.1
 _UNBROKEN = 1.35  # times the median step of azimuth
+MORE_THAN_A_TURN = 1.01
 _SAME_SURFACE = 0.05  # relative difference of distance of neighbours on a surface
 _COLUMN_SEARCH = 0.03  # share of the first guess of the columns searched to both sides
 # Search of beams: points this near to a line are on it, bins of further lines, least peak of them.
@@ -57,6 +58,7 @@ class ColumnFit(NamedTuple):
     residual: Floats  # (P,) azimuth minus the nearest step
     dropped_share: float  # of the shots on surfaces
     double_share: float  # points of the same shot as their neighbour
+    turns: float  # of the head within a scan; less where points are in another order
 
 
 def fit_beams(beam: Indices, distance_m: Floats, z_m: Floats) -> BeamFit:
@@ -128,7 +130,7 @@ def fit_columns(beam: Indices, azimuth: Floats, distance_m: Floats, scan: Indice
     Raises:
         ValueError: If no beam has neighbours in azimuth.
     """
-    azimuth, inverse = azimuth % (2 * math.pi), 1 / distance_m
+    turned, azimuth, inverse = azimuth, azimuth % (2 * math.pi), 1 / distance_m
     order = np.lexsort((azimuth, beam, scan))
     before, after = order[:-1], order[1:]
     is_beside = (beam[before] == beam[after]) & (scan[before] == scan[after])
@@ -140,7 +142,10 @@ def fit_columns(beam: Indices, azimuth: Floats, distance_m: Floats, scan: Indice
     if len(ahead) == 0:
         raise ValueError("no beam has neighbouring points, so its columns are unknown")
     usual = float(np.median(ahead))
-    column_rad = float(ahead[ahead < _UNBROKEN * usual].mean())
+    turns = _turns(beam, turned, scan)
+    column_rad = usual  # where shots of a second turn lie between the first ones
+    if turns < MORE_THAN_A_TURN:
+        column_rad = float(ahead[ahead < _UNBROKEN * usual].mean())
 
     num_beams = int(beam.max()) + 1
     lateral_m = _lateral(beam[before], step, change, column_rad, num_beams)
@@ -164,7 +169,18 @@ def fit_columns(beam: Indices, azimuth: Floats, distance_m: Floats, scan: Indice
         residual,
         num_dropped / (num_dropped + int(num_level)),
         int(doubles) / len(azimuth),
+        turns,
     )
+
+
+def _turns(beam: Indices, azimuth: Floats, scan: Indices) -> float:
+    """Turns of the head within a scan, by the steps of azimuth in the order of the file."""
+    order = np.lexsort((beam, scan))
+    group = (scan * (beam.max() + 1) + beam)[order]
+    step = (np.diff(azimuth[order]) + math.pi) % (2 * math.pi) - math.pi
+    is_beside = group[1:] == group[:-1]
+    total = np.bincount(group[1:][is_beside], step[is_beside])
+    return float(np.median(np.abs(total[np.unique(group[1:][is_beside])]))) / (2 * math.pi)
 
 
 def _lateral(

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from lidarsim.clouds import find_files
 from lidarsim.ground import ground_of
-from lidarsim.sensors.beams import BeamFit, ColumnFit, fit_beams, fit_columns
+from lidarsim.sensors.beams import MORE_THAN_A_TURN, BeamFit, ColumnFit, fit_beams, fit_columns
 from lidarsim.sensors.files import SensorFile, write_sensor
 from lidarsim.sensors.recordings import (
     WORKS_STILL,
@@ -178,11 +178,17 @@ def estimate_sensor(scans: Sequence[Any] | str | Path) -> SensorEstimate:
     columns = fit_columns(points.beam, azimuth, distance_m, points.scan)
     if columns.coherence < _COHERENT:
         notes.append("azimuths lie on no common steps: the columns follow from the mean step")
+    if columns.turns > MORE_THAN_A_TURN:
+        notes.append(
+            f"a scan is {360 * columns.turns:.0f} degrees long: directions that it sees twice have "
+            "one pixel in an image"
+        )
     direction, head = _rotation(read, points, azimuth)
     num_columns, offset, sure_columns = columns.columns, columns.offset, columns.coherence
     if points.column is not None and head is not None:
         num_columns, sure_columns = int(read[0].num_columns or 0), 1.0
-        offset = _offsets(points, azimuth - columns.lateral_m[points.beam] / distance_m - head)
+        turned = azimuth - columns.lateral_m[points.beam] / distance_m - head
+        offset = _offsets(points, turned, 2 * math.pi / num_columns)
 
     sectors, covered_deg = _blind_sectors(azimuth)
     if covered_deg < _WHOLE_TURN_DEG:
@@ -319,13 +325,14 @@ def _sign(azimuth: Floats, beam: NDArray) -> float:
     return float(np.sign(np.median(step[np.diff(beam) == 0])))
 
 
-def _offsets(points: BeamPoints, turned: Floats) -> Floats:
-    """Azimuth offset ``(H,)`` from the head, whose zero is such that their mean is zero."""
+def _offsets(points: BeamPoints, turned: Floats, column_rad: float) -> Floats:
+    """Azimuth offset ``(H,)`` from the head, whose mean is less than half a column."""
     num_beams = int(points.beam.max()) + 1
     real = np.bincount(points.beam, np.cos(turned), num_beams)
     imaginary = np.bincount(points.beam, np.sin(turned), num_beams)
     offset = np.arctan2(imaginary, real)
     middle = math.atan2(np.sin(offset).mean(), np.cos(offset).mean())
+    middle = round(middle / column_rad) * column_rad  # whole columns, to keep the steps of azimuth
     return (offset - middle + math.pi) % (2 * math.pi) - math.pi
 
 

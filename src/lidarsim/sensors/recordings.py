@@ -26,6 +26,8 @@ LEAST_DISTANCE_M = 0.1  # of points of a beam, in the plane: nearer ones have no
 _FEWEST_BEAMS = 4
 _LEAST_SHARE = 0.6  # of the beams of the fullest scan; a scan with fewer is of another sensor
 _FEW_POINTS = 0.1  # of a ring off its line
+# Mean squares of the direction cosines: the flat axis of a turn, and least of the two others.
+_FLAT_SHARE, _TURNED = 0.5, 0.1
 _SAME_BEAM_SHARE = 0.15  # of the pitch between the same beam of two scans
 WORKS_STILL = "`r3dpa data weather`, `r3dpa data view` and metrics on points still take such scans"
 
@@ -72,10 +74,23 @@ def read_scan_of(scan: Any, number: int) -> SensorScan:
     if is_zero.all():
         raise ScanError(f"{name}: all of its {len(cloud)} points are 0; export it again")
     cloud.check_metres()
+    _check_upright(name, cloud.points)
     usable = column is not None and shape is not None and len(column) == len(cloud)
     return SensorScan(
         name, cloud, column if usable else None, shape[1] if shape and usable else None
     )
+
+
+def _check_upright(name: str, points: NDArray) -> None:
+    """Refuse a turn around another axis than z, as in the frame of a camera."""
+    range_m = np.linalg.norm(points.astype(float), axis=1).clip(LEAST_DISTANCE_M)
+    x, y, z = np.square(points / range_m[:, None]).mean(axis=0)
+    for axis, along, other in (("x", x, y), ("y", y, x)):
+        if along < _FLAT_SHARE * z and min(other, z) > _TURNED:
+            raise ScanError(
+                f"{name}: the scan is flattest along {axis}: turn the points so that z points up, "
+                "x forward and y left"
+            )
 
 
 def _organised_file(path: Path) -> NDArray | None:

@@ -59,12 +59,15 @@ class LidarSensor:
             )
 
     @classmethod
-    def of(cls, model: str | Path | SpinningLidar, columns: int | None = None) -> LidarSensor:
+    def of(
+        cls, model: str | Path | SpinningLidar, columns: int | None = None, rows: int | None = None
+    ) -> LidarSensor:
         """Return the range image of a sensor: a row per beam, half a pitch around the outer ones.
 
         Args:
             model: Sensor, or what :func:`lidarsim.load_sensor` takes: a preset or a YAML file.
             columns: Columns of the image; default: the shots of a turn.
+            rows: Rows of the image; default: the beams. Further rows lie below, at the last pitch.
 
         Example:
             >>> LidarSensor.of("vlp16", columns=1024).inclination_max_deg
@@ -73,11 +76,17 @@ class LidarSensor:
         sensor = model if isinstance(model, SpinningLidar) else load_sensor(model)
         degrees = np.degrees(sensor.lasers.inclination_rad)
         first, last = (degrees[:2], degrees[-2:]) if len(degrees) > 1 else ((1, -1), (1, -1))
+        beams = rows or sensor.num_beams
+        if beams < sensor.num_beams:
+            raise ValueError(f"{sensor.num_beams} beams need as many rows, got rows {beams}")
+        further_rows = beams - sensor.num_beams
         return cls(
-            beams=sensor.num_beams,
+            beams=beams,
             columns=columns or sensor.shots,
             inclination_max_deg=round(float(degrees[0] + (first[0] - first[1]) / 2), 6),
-            inclination_min_deg=round(float(degrees[-1] - (last[0] - last[1]) / 2), 6),
+            inclination_min_deg=round(
+                float(degrees[-1] - (further_rows + 0.5) * (last[0] - last[1])), 6
+            ),
             range_min_m=sensor.min_range_m,
             range_max_m=sensor.max_range_m,
         )

@@ -32,7 +32,8 @@ FACTS = (
 _ALLOWED_PACKAGES = ("r3dpa.nn.", "r3dpa.features.", "r3dpa.baselines.")
 _NUM_LISTED = 10
 _LARGEST_SIDE = 2048  # of images, which no weights may have
-_AVERAGES = {"sit": "ema", "latent_norm": "ema_latent_norm"}
+#: Averaged copy of a network, which it may start from.
+AVERAGES = {"sit": "ema", "latent_norm": "ema_latent_norm"}
 # Arguments that change what the weights compute but not the shape of any weight, and the attribute
 # in which a network, or one of its layers, keeps each.
 _SHAPELESS_ARGS = {
@@ -249,7 +250,7 @@ def load_into(networks: Mapping[str, nn.Module], checkpoint: Checkpoint, stage: 
         ValueError: Listing for ``stage`` what is absent or does not fit; nothing is changed then.
     """
     problems: list[str] = []
-    sources = {n: n if n in checkpoint.networks else _AVERAGES.get(n, n) for n in networks}
+    sources = {n: n if n in checkpoint.networks else AVERAGES.get(n, n) for n in networks}
     for name, network in networks.items():
         try:
             state = checkpoint.network(sources[name])

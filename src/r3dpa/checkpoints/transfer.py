@@ -16,7 +16,7 @@ from r3dpa.io import weights_sha256
 from r3dpa.nn import VAE, LatentNorm, SiT, VelocityNetwork
 
 Weights = Mapping[str, Tensor]
-Result = Literal["kept", "fresh", "resized", "truncated"]
+Result = Literal["kept", "fresh", "resized", "truncated", "dropped"]
 # Largest difference between channels in how the latent scales of two models differ: on a frozen
 # VAE, running statistics 100 to 900 steps apart differ by up to 0.031 (batch 4) or 0.014 (32).
 NORM_TOLERANCE = 0.05
@@ -28,7 +28,7 @@ class TransferRow(NamedTuple):
 
     group: str
     num_tensors: int  #: in the receiving network
-    result: Result  #: ``fresh``: initial value; ``resized``: positions of this run's token grid
+    result: Result  #: ``fresh``: initial value; ``resized``: in the size of this run's images
     reason: str
 
 

@@ -36,6 +36,7 @@ COMMANDS = {
     "data objects": Command("data:objects", "write mean features of object classes for inpaint"),
     "data sensors": Command("sensors:sensors", "list sensor presets"),
     "data sensor": Command("sensors:sensor", "estimate a sensor from its scans"),
+    "data plan": Command("sensors:plan", "plan how to fine-tune r3dpa-s on scans of a sensor"),
     "data reference": Command("evaluate:reference", "write statistics of real scans", True),
     "data weather": Command("weather:weather", "simulate weather on recorded scans", True),
     "data corrupt": Command("weather:corrupt", "add sensor faults to recorded scans", True),

@@ -25,6 +25,7 @@ def sample(
     decoder: Literal["full", "thin"] | None = None,
     precision: Literal["fp32", "bf16"] = "fp32",
     compile: bool = False,
+    sensor: str | None = None,
     **options: Any,
 ) -> str:
     """Generate scenes from a checkpoint: points, range images, pictures and a page to turn.
@@ -54,15 +55,18 @@ def sample(
             ``--quality instant`` where the checkpoint has one, else full.
         precision: Weights of the networks; ``bf16`` needs a processor or GPU that computes in it.
         compile: Compile the networks: a minute or more at first, then faster.
+        sensor: Preset of ``r3dpa data sensors`` or YAML whose beams the scenes are seen by; refused
+            where it sees more than the model knows; default: the sensor of the checkpoint.
         **options: See :class:`SceneOptions`.
     """
-    from dataclasses import asdict
+    from dataclasses import asdict, replace
 
     from r3dpa.checkpoints import read_checkpoint, read_snapshot
     from r3dpa.cli.scene_files import generate_all, provenance, written
     from r3dpa.data.scene_writer import SceneWriter
     from r3dpa.flow.sampler import Quality
-    from r3dpa.generation import Autoguidance, SamplerConfig
+    from r3dpa.generation import Autoguidance, SamplerConfig, geometry_of
+    from r3dpa.geometry import projection_for
     from r3dpa.io import usable_device
     from r3dpa.nn import ThinDecoder
     from r3dpa.stages import BASELINE_STAGES, published_sampler, scene_generator
@@ -81,6 +85,9 @@ def sample(
     files = SceneOptions(**options)
     device = usable_device(files.device)
     checkpoint = read_checkpoint(files.ckpt)
+    seen_by = None
+    if sensor is not None:
+        seen_by = projection_for(sensor, geometry_of(checkpoint).projection)
     sampler: SamplerConfig | Quality | None = quality
     if given and checkpoint.stage in BASELINE_STAGES:
         sampler = published_sampler(checkpoint).changed(**given)
@@ -115,15 +122,18 @@ def sample(
         compile=compile,
     )
     generator.prepare()
-    request = provenance(checkpoint, files, num, device, generator.geometry)
+    geometry = generator.geometry
+    if seen_by is not None:
+        geometry = replace(geometry, projection=seen_by, grid_size=(1, 1))
+    request = provenance(checkpoint, files, num, device, geometry)
     thin = isinstance(getattr(generator, "vae", None), ThinDecoder)  # a baseline has no VAE
     request |= {"precision": precision, "compile": compile, "decoder": "thin" if thin else "full"}
     request |= {"sampler": asdict(generator.sampler), "autoguidance": about_guide}
     request["guidance_scale"] = getattr(generator, "guidance_scale", 1.0)
-    projection = generator.geometry.projection
+    projection = geometry.projection
     with SceneWriter(files.out, num, projection, files.formats, request, files.overwrite) as writer:
-        measured = generate_all(generator, writer, files.batch_size, files.seed)
-        opened = draw_scenes(files.out, writer.range_path, files.pictures, generator.geometry)
+        measured = generate_all(generator, writer, files.batch_size, files.seed, seen_by)
+        opened = draw_scenes(files.out, writer.range_path, files.pictures, geometry)
         writer.finish(request | measured)
     line = f"{num} scenes in {files.out}: {measured['nfe']:.5g} network evaluations each"
     if measured["drawn_by_last_run"]:
@@ -131,4 +141,9 @@ def sample(
     note = f"sampler: {generator.sampler.summary}"
     if not given and generator.sampler == SamplerConfig.of_quality(quality or "good"):
         note = SamplerConfig.quality_line(quality or "good")  # measured, unlike a baseline's
+    if seen_by is not None:
+        view = seen_by.sensor
+        line += (
+            f", as seen by {sensor}: {view.beams} x {view.columns}, up to {view.range_max_m:g} m"
+        )
     return "\n".join(filter(None, (note, line, opened)))

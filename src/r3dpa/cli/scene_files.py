@@ -20,7 +20,7 @@ from r3dpa.cli.parser import SceneOptions
 from r3dpa.data.scans import find_scans
 from r3dpa.data.scene_writer import SceneWriter
 from r3dpa.generation import SceneGenerator
-from r3dpa.geometry import ScanGeometry
+from r3dpa.geometry import BeamProjection, ScanGeometry
 from r3dpa.io import source_commit
 from r3dpa.pretrained import without_features
 
@@ -61,9 +61,16 @@ def provenance(
 
 
 def generate_all(
-    generator: SceneGenerator | BaselineGenerator, writer: SceneWriter, batch_size: int, seed: int
+    generator: SceneGenerator | BaselineGenerator,
+    writer: SceneWriter,
+    batch_size: int,
+    seed: int,
+    seen_by: BeamProjection | None = None,
 ) -> dict[str, Any]:
-    """Generate and write the missing scenes; return evaluations and time."""
+    """Generate and write the missing scenes, as a sensor sees them if one is given.
+
+    Return evaluations and time.
+    """
     first_index, start = writer.num_done, time.perf_counter()
     with tqdm(
         total=writer.num, initial=first_index, unit="scene", desc="sampling", disable=None
@@ -71,6 +78,8 @@ def generate_all(
         for first in range(first_index, writer.num, batch_size):
             indices = range(first, min(first + batch_size, writer.num))
             batch = generator.generate(indices, seed)
+            if seen_by is not None:
+                batch = batch.seen_by(seen_by)
             writer.put(batch.range_m, batch.nfe, batch.intensity, batch.labels)
             progress.update(len(indices))
     writer.close()

@@ -1,13 +1,13 @@
-"""``r3dpa data sensors`` and ``r3dpa data sensor``: presets, and estimates from scans."""
+"""``r3dpa data sensors``, ``sensor`` and ``plan``: presets, estimates, and fine-tuning on scans."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import numpy as np
-from jsonargparse.typing import PositiveInt
+from jsonargparse.typing import PositiveFloat, PositiveInt
 
-from r3dpa.cli.parser import check_file
+from r3dpa.cli.parser import check_file, check_folder
 
 
 def sensors() -> str:
@@ -52,3 +52,35 @@ def sensor(scans: Path, *, out: Path, num: PositiveInt = 30) -> str:
     table = text_table(estimated.rows(), ["quantity", "value", "confidence"], "llr", "plain")
     notes = [f"note: {note}" for note in estimated.notes]
     return "\n".join([table, *notes, f"{out}", f"{picture}"])
+
+
+def plan(
+    sensor: str,
+    *,
+    scans: Path,
+    out: Path,
+    minutes: PositiveFloat = 10,
+    columns: PositiveInt = 1024,
+    workers: PositiveInt = 2,
+) -> str:
+    """Plan how to fine-tune r3dpa-s on scans of a sensor, within a time.
+
+    Writes ``data.yaml``, ``vae.yaml``, ``flow.yaml`` and ``simulate.yaml`` for the commands of
+    ``make my-sensor``. A few scans are simulated to measure the machine.
+
+    Args:
+        sensor: Preset of ``r3dpa data sensors`` or YAML of ``r3dpa data sensor``.
+        scans: Folder of scans of that sensor; every fifth is held out, at least two.
+        out: Folder for the files, and for what the commands write.
+        minutes: Time for simulation and training on two cores.
+        columns: Columns of the range images, a multiple of 128.
+        workers: Processes.
+    """
+    check_folder(out)
+    from r3dpa.data.sensor_plan import SensorPlan
+
+    # Plain numbers, which YAML can hold.
+    numbers = (float(minutes), int(columns), int(workers))
+    sensor_plan = SensorPlan.of(sensor, str(scans), *numbers)
+    sensor_plan.write(out)
+    return str(sensor_plan)

@@ -246,7 +246,7 @@ class StageCLI(LightningCLI):
         if isinstance(self.model, GenerativeModule) and self._ckpt_path is None:
             self.model.load_previous_stage()
             option, consequence = _WITHOUT_WEIGHTS.get(self.model.stage, ("", ""))
-            if option and getattr(self.model, option) is None:
+            if option and getattr(self.model, option) is None and self.model.init_from is None:
                 rank_zero_info(f"without --model.init_args.{option} {consequence}")
         for line in batch_lines(self.model, self.datamodule, self.trainer):
             rank_zero_info(line)

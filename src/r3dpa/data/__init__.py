@@ -28,9 +28,9 @@ from r3dpa.data.store import StoreError
 _ON_FIRST_USE = {
     "ImageDataModule": "image_datamodule",
     "KITTI360DataModule": "datamodules",
-    "LabelledPointDataModule": "datamodules",
+    "LabelledPointDataModule": "point_datamodules",
     "LidarDataModule": "datamodules",
-    "PointDataModule": "datamodules",
+    "PointDataModule": "point_datamodules",
     "SimulatedDataModule": "datamodules",
     "SimulatedImageDataModule": "range_images",
 }

@@ -1,11 +1,8 @@
-"""Lightning data modules: scans in, :class:`LidarBatch` or points out."""
+"""Lightning data modules: scans in, :class:`LidarBatch` out."""
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable
 from dataclasses import replace
-from glob import has_magic
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -19,13 +16,20 @@ from lidarsim.drive_files import drive_name
 from lidarsim.scene import Conditions
 from lidarsim.weather import WeatherPrior
 from r3dpa.data.augmentation import Augmentation, AugmentedDataset
-from r3dpa.data.datasets import CachedImages, DrawnPoints, LabelledPoints, LidarDataset
-from r3dpa.data.feature_grids import Extractor, FeatureGrids, any_settings, write_feature_grids
+from r3dpa.data.datasets import CachedImages, LidarDataset
+from r3dpa.data.feature_grids import (
+    Extractor,
+    FeatureGrids,
+    any_settings,
+    default_features_dir,
+    write_feature_grids,
+)
 from r3dpa.data.loader_module import LoaderModule
 from r3dpa.data.loaders import at_least
 from r3dpa.data.scans import Scan, evenly, find_scans, kitti360_scans
 from r3dpa.data.store import CachedTensors
 from r3dpa.geometry import (
+    BeamProjection,
     LidarSensor,
     Projection,
     RangeCodec,
@@ -38,6 +42,7 @@ _SENSOR = LidarSensor()
 _CODEC = RangeCodec()
 _AUGMENTATION = Augmentation()
 _SCALR_DIM = 768  # width of the published feature grids
+_COLUMNS = 1024  # of the images of named sensors
 _SCANS_TO_FIT = 8  # scans that the ring inclinations are measured in
 _EMPTY_SPLIT = (
     "all scans are of the other split. Look at val_every and val_drives, or, in the KITTI-360 "
@@ -54,11 +59,16 @@ class LidarDataModule(LoaderModule):
 
     Args:
         scans: Folder (searched with its sub-folders), ``.bin`` file, glob, or list of these.
-        sensor: Image size, field of view and range limits.
+        sensor: Image size, field of view and range limits; or a preset of ``r3dpa data sensors``
+            or a YAML of ``r3dpa data sensor``, which gives all of them but the columns.
+        image_columns: Columns of the images of a ``sensor`` given by its name or file, 1024 by
+            default.
         projection: ``"spherical"``: rows of equal pitch; ``"rings"``: one row per laser, for scans
-            stored ring after ring, at inclinations measured in the first training scans.
-        codec: Metres to [-1, 1]. With ``num_classes`` every scan needs labels, see
-            :func:`r3dpa.data.labels.read_labels`.
+            stored ring after ring, at inclinations measured in the first training scans;
+            ``"beams"``: one row per beam of a named sensor, for which it is the default, and empty
+            rows up to a multiple of 16, for scans in any order.
+        codec: Metres to [-1, 1], by default up to the largest range of the sensor. With
+            ``num_classes`` every scan needs labels, see :func:`r3dpa.data.labels.read_labels`.
         grid_size: Rows and columns (h, w) of the feature grid.
         extractor: Frozen network, see :class:`r3dpa.data.Extractor`; makes the grids that are
             missing before training. Without it, ``features_dir`` must hold all of them.
@@ -71,6 +81,9 @@ class LidarDataModule(LoaderModule):
         val_every: Hold out every n-th scan; None for no validation split. Neighbours in a recording
             look alike: hold out whole recordings by ``val_drives`` for an honest score.
         val_drives: Folders, relative to the root, that are held out whole; replaces ``val_every``.
+        further_scans: Scans to train on beside ``scans``, such as simulated ones; none of
+            them is held out. Folder, file or glob.
+        repeats: How often a training scan of ``scans`` occurs per epoch beside ``further_scans``.
         limit: Maximum scans per split, evenly spaced.
         columns: Columns of files without names, such as ``x,y,z,intensity,time``; by default as the
             values show.
@@ -90,8 +103,8 @@ class LidarDataModule(LoaderModule):
     def __init__(
         self,
         scans: str | list[str],
-        sensor: LidarSensor = _SENSOR,
-        projection: Literal["spherical", "rings"] = "spherical",
+        sensor: LidarSensor | str = _SENSOR,
+        projection: Literal["spherical", "rings", "beams"] | None = None,
         codec: RangeCodec = _CODEC,
         grid_size: tuple[int, int] = (8, 64),
         extractor: nn.Module | None = None,
@@ -106,19 +119,33 @@ class LidarDataModule(LoaderModule):
         prepare_data_per_node: bool = False,
         augmentation: Augmentation = _AUGMENTATION,
         weather: WeatherPrior | None = None,
+        image_columns: int | None = None,
+        further_scans: str | None = None,
+        repeats: int = 1,
     ) -> None:
         super().__init__(batch_size, num_workers, seed)
         self.prepare_data_per_node = prepare_data_per_node
         at_least(2, val_every=val_every)
-        at_least(1, limit=limit)
+        at_least(1, limit=limit, image_columns=image_columns, repeats=repeats)
+        self.scans, self.further_scans, self.repeats = scans, further_scans, repeats
+        self.beams: BeamProjection | None = None
+        if isinstance(sensor, str):
+            self.beams = BeamProjection.for_networks(sensor, image_columns or _COLUMNS)
+            sensor = self.beams.sensor
+        elif image_columns is not None or projection == "beams":
+            raise ValueError(
+                "image_columns and projection: beams need a sensor given as a preset of `r3dpa "
+                "data sensors` or a YAML of `r3dpa data sensor`"
+            )
         if not isinstance(sensor, LidarSensor):
             raise ValueError(
-                "sensor must be a LidarSensor (image size, field of view and range limits), got "
-                f"{sensor!r}; the instrument of simulated scans is simulation_sensor"
+                "sensor must be a LidarSensor (image size, field of view and range limits), a "
+                f"preset or a YAML file, got {sensor!r}"
             )
-        self.scans, self.sensor, self.codec = scans, sensor, codec
+        self.sensor = sensor
         self.columns = tuple(columns.split(",") if isinstance(columns, str) else columns or ())
-        self.projection_kind = projection
+        self.codec = codec.reaching(self.sensor.range_max_m)
+        self.projection_kind = projection or ("spherical" if self.beams is None else "beams")
         self.grid_size = (grid_size[0], grid_size[1])
         self.extractor = extractor
         self.features_dir = self._find_features_dir(features_dir)
@@ -127,7 +154,7 @@ class LidarDataModule(LoaderModule):
         if self.features_dir is not None:
             augmentation.check_extractor(extractor, self.grid_size[1])
         self.weather_prior = weather
-        if weather is not None and projection == "rings":
+        if weather is not None and self.projection_kind == "rings":
             raise ValueError(
                 "weather adds points at the end of a scan, which then has no order of rings: use "
                 "projection: spherical"
@@ -189,7 +216,10 @@ class LidarDataModule(LoaderModule):
             held_out = {scan for scan in scans if scan.drive in self.val_drives}
         else:
             held_out = set(scans[:: self.val_every] if self.val_every else [])
-        return [scan for scan in scans if scan not in held_out], sorted(held_out)
+        train = [scan for scan in scans if scan not in held_out]
+        if self.further_scans is not None:
+            train = self.repeats * train + find_scans(self.further_scans)
+        return train, sorted(held_out)
 
     def limited_split(self) -> tuple[list[Scan], list[Scan]]:
         """Training and held-out scans within ``limit``."""
@@ -268,6 +298,13 @@ class LidarDataModule(LoaderModule):
         """All scans in order, none twice."""
         return self.loader(self.all_set, train=False)
 
+    @property
+    def _known_projection(self) -> Projection:
+        """Projection of the sensor, unless scans are needed for it."""
+        if self.projection_kind == "beams" and self.beams is not None:
+            return self.beams
+        return SphericalProjection(self.sensor)
+
     def _find_features_dir(self, features_dir: str | None) -> Path | None:
         if features_dir is not None:
             return Path(features_dir)
@@ -280,34 +317,12 @@ class LidarDataModule(LoaderModule):
 
     def _scans_and_projection(self) -> tuple[list[Scan], list[Scan], Projection]:
         train, val = self.split()
-        projection: Projection = SphericalProjection(self.sensor)
+        projection = self._known_projection
         if self.projection_kind == "rings":
             first = (train or val)[:_SCANS_TO_FIT]
             points = (torch.from_numpy(scan.read(self.sensor)[:, :3]) for scan in first)
             projection = RingProjection.fit(points, self.sensor)
         return evenly(train, self.limit), evenly(val, self.limit), projection
-
-
-def default_features_dir(scans: str | list[str], extractor: str) -> Path:
-    """Folder of feature grids for a single folder of scans where none is given.
-
-    ``runs/feature_grids/<folder>-<hash of its path>/<extractor>``, so that nothing is written
-    beside the scans of a user; ``<scans>/feature_grids/<extractor>`` where that folder exists.
-
-    Raises:
-        ValueError: If the scans come from a file, glob or list.
-    """
-    if not isinstance(scans, str) or has_magic(scans) or Path(scans).is_file():
-        raise ValueError(
-            f"features_dir is needed for scans given as {scans!r}: only a single folder has a "
-            "default place for its feature grids"
-        )
-    beside = Path(scans) / "feature_grids" / extractor
-    if beside.is_dir():
-        return beside
-    place = Path(scans).absolute()
-    digest = hashlib.sha256(str(place).encode()).hexdigest()[:8]
-    return Path("runs", "feature_grids", f"{place.name}-{digest}", extractor)
 
 
 class KITTI360DataModule(LidarDataModule):
@@ -394,95 +409,3 @@ class SimulatedDataModule(LidarDataModule):
             weather=self.weather,
         )
         super().prepare_data()
-
-
-class PointDataModule(LoaderModule):
-    """Points of the scans of another data module, prepared at random in each epoch.
-
-    Batches are lists of what ``prepare`` returns; no feature grids are made.
-
-    Args:
-        source: Scans and their split, simulated where it does that. Give it ``extractor: null``.
-            Where it caches images, points lie at the centres of pixels, and its codec must have a
-            channel of intensity.
-        prepare: Function of the points ``(P, 4)`` and a generator, such as
-            ``r3dpa.features.Masking``.
-        batch_size: Scans per batch and process.
-        num_workers: Loader processes per training process.
-        seed: Seed of order and draws.
-        weather: Weather of training scans, drawn anew in each epoch; none by default.
-    """
-
-    points_class = DrawnPoints
-
-    def __init__(
-        self,
-        source: LidarDataModule,
-        prepare: Callable[..., Any],
-        batch_size: int = 2,
-        num_workers: int = 0,
-        seed: int = 0,
-        weather: WeatherPrior | None = None,
-    ) -> None:
-        super().__init__(batch_size, num_workers, seed)
-        if source.extractor is not None:
-            raise ValueError(
-                "--data.init_args.source.init_args.extractor must be null: a network on points is "
-                "trained without feature grids"
-            )
-        self.source, self.prepare, self.weather_prior = source, prepare, weather
-
-    def prepare_data(self) -> None:
-        """Simulate the scans, where the source does."""
-        self.source.prepare_data()
-
-    def setup(self, stage: str) -> None:
-        """Index the scans."""
-        images = self.source.images
-        if images is not None and not self.source.codec.intensity_channel:
-            raise ValueError(
-                "--data.init_args.source caches ranges alone, and a network on points reads "
-                "intensities: set source.init_args.codec.intensity_channel to true"
-            )
-        self.train_set, self.val_set = (
-            self.points_class(
-                scans, self.source.sensor, self.prepare, self.seed, self.weather_prior, images
-            )
-            for scans in self.source.limited_split()
-        )
-
-    def train_dataloader(self) -> DataLoader[Any]:
-        """Shuffled, resumable loader of full batches."""
-        return self.loader(self.train_set, train=True, with_epoch=True, collate_fn=list)
-
-    def val_dataloader(self) -> DataLoader[Any]:
-        """Held-out scans in order, none twice, each drawn the same every time."""
-        return self.loader(self.val_set, train=False, collate_fn=list)
-
-
-class LabelledPointDataModule(PointDataModule):
-    """Points of the scans of another data module, masked, with the classes of those that have any.
-
-    Weather would move points away from their labels, so there is none.
-
-    Args:
-        source: Scans and their split, with or without label files, see
-            :func:`r3dpa.data.labels.read_labels`, or with classes in its cached images. Give it
-            ``extractor: null``.
-        prepare: An ``r3dpa.features.Masking``.
-        batch_size: Scans per batch and process.
-        num_workers: Loader processes per training process.
-        seed: Seed of order and draws.
-    """
-
-    points_class = LabelledPoints
-
-    def __init__(
-        self,
-        source: LidarDataModule,
-        prepare: Callable[..., Any],
-        batch_size: int = 2,
-        num_workers: int = 0,
-        seed: int = 0,
-    ) -> None:
-        super().__init__(source, prepare, batch_size, num_workers, seed)

@@ -7,11 +7,13 @@ feature width, B batch.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from glob import has_magic
 from pathlib import Path
 from typing import Any, Literal, Protocol, Self
 
@@ -330,3 +332,25 @@ def features_lock(features_dir: str | Path) -> Iterator[None]:
         folder.mkdir(parents=True, exist_ok=True)
     with only_writer(folder / ".lock", f"makes feature grids in {folder}", wait=True):
         yield
+
+
+def default_features_dir(scans: str | list[str], extractor: str) -> Path:
+    """Folder of feature grids for a single folder of scans where none is given.
+
+    ``runs/feature_grids/<folder>-<hash of its path>/<extractor>``, so that nothing is written
+    beside the scans of a user; ``<scans>/feature_grids/<extractor>`` where that folder exists.
+
+    Raises:
+        ValueError: If the scans come from a file, glob or list.
+    """
+    if not isinstance(scans, str) or has_magic(scans) or Path(scans).is_file():
+        raise ValueError(
+            f"features_dir is needed for scans given as {scans!r}: only a single folder has a "
+            "default place for its feature grids"
+        )
+    beside = Path(scans) / "feature_grids" / extractor
+    if beside.is_dir():
+        return beside
+    place = Path(scans).absolute()
+    digest = hashlib.sha256(str(place).encode()).hexdigest()[:8]
+    return Path("runs", "feature_grids", f"{place.name}-{digest}", extractor)

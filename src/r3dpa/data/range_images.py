@@ -30,7 +30,6 @@ from r3dpa.geometry import (
     LidarSensor,
     Pixels,
     Projection,
-    SphericalProjection,
     points_of,
     project_pixels,
     projection_to_dict,
@@ -96,7 +95,7 @@ class SimulatedImageDataModule(LidarDataModule):
             ``sensor`` is about the range images.
         effects: ``auto``, ``on`` or ``off`` by effect; those not named are ``auto``.
         weather: Weather of all scans; drawn where None.
-        kwargs: Arguments of :class:`LidarDataModule`; only ``projection: spherical``.
+        kwargs: Arguments of :class:`LidarDataModule`, without ``projection: rings``.
     """
 
     makes_scans = True
@@ -115,8 +114,8 @@ class SimulatedImageDataModule(LidarDataModule):
         super().__init__(scans=root, val_every=None, val_drives=None, **kwargs)
         at_least(1, every=every)
         at_least(2, num_scans=num_scans)  # one of them is held out
-        if self.projection_kind != "spherical":
-            raise ValueError("projection must be spherical: the points are not kept to fit rings")
+        if self.projection_kind == "rings":
+            raise ValueError("projection must not be rings: the points are not kept to fit them")
         self.root, self.every, self.num_scans = root, every, num_scans
         self.simulation_seed, self.simulation_sensor = simulation_seed, simulation_sensor
         self.effects, self.weather = effects, weather
@@ -140,7 +139,7 @@ class SimulatedImageDataModule(LidarDataModule):
         """Simulate what is missing, and make its feature grids."""
         train, val = self.limited_split()
         images: list[Any] = sorted(train + val)
-        projection = SphericalProjection(self.sensor)
+        projection = self._known_projection
         grids = None
         if self.features_dir is not None and self.extractor is not None:
             extractor = cast(Extractor, self.extractor.eval())
@@ -165,7 +164,7 @@ class SimulatedImageDataModule(LidarDataModule):
 
     def points(self, scan: Any) -> Tensor:
         """Points ``(P, 3)`` at the centres of the pixels."""
-        return points_of(self.images.read(scan).range_m, SphericalProjection(self.sensor))
+        return points_of(self.images.read(scan).range_m, self._known_projection)
 
     @property
     def _with_values(self) -> bool:
@@ -180,7 +179,7 @@ class SimulatedImageDataModule(LidarDataModule):
             "sensor": self.simulation_sensor,
             "effects": self.effects,
             "weather": None if self.weather is None else asdict(self.weather),
-            "projection": projection_to_dict(SphericalProjection(self.sensor)),
+            "projection": projection_to_dict(self._known_projection),
         }
         shape = (self.sensor.beams, self.sensor.columns)
         if not self._with_values:
@@ -229,7 +228,7 @@ class SimulatedImageDataModule(LidarDataModule):
         images = CachedPixels(CachedTensors(self._store, missing), self.sensor.range_max_m)
         dataset = _CachedPoints(missing, images, self.sensor, extractor.prepare)
         loader = plain_loader(dataset, 1, self.num_workers, collate_fn=list)
-        projection = SphericalProjection(self.sensor)
+        projection = self._known_projection
         with grids.writer() as writer:
             for samples in tqdm(loader, desc="feature grids", unit="scan", disable=None):
                 pooled = pooled_grids(extractor, samples, projection, [self.grid_size])

@@ -1,6 +1,7 @@
 """Sensor, projections and range images: the one place that maps points to pixels."""
 
 from lidarsim.sensors.view import LidarSensor
+from r3dpa.geometry.beams import BeamProjection
 from r3dpa.geometry.codec import (
     Pixels,
     RangeCodec,
@@ -8,6 +9,7 @@ from r3dpa.geometry.codec import (
     project_pixels,
     projection_to_dict,
 )
+from r3dpa.geometry.other_view import projection_for, values_in, view_of
 from r3dpa.geometry.projection import (
     Projection,
     RingProjection,
@@ -16,6 +18,7 @@ from r3dpa.geometry.projection import (
     points_of,
     pool_cells,
     range_image,
+    share_kept,
     unproject,
     values_at_returns,
 )
@@ -33,6 +36,7 @@ __all__ = [
     "NUM_CLASSES",
     "SEMANTIC_CLASSES",
     "UNKNOWN_CLASS",
+    "BeamProjection",
     "LidarSensor",
     "Pixels",
     "Projection",
@@ -46,8 +50,12 @@ __all__ = [
     "points_of",
     "pool_cells",
     "project_pixels",
+    "projection_for",
     "projection_to_dict",
     "range_image",
+    "share_kept",
     "unproject",
     "values_at_returns",
+    "values_in",
+    "view_of",
 ]

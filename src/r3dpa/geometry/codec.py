@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal, NamedTuple, Self
 
 import torch
 from torch import Tensor
 
 from lidarsim.sensors.view import LidarSensor
+from r3dpa.geometry.beams import BeamProjection
 from r3dpa.geometry.projection import (
     Projection,
     RingProjection,
@@ -19,7 +20,11 @@ from r3dpa.geometry.projection import (
 from r3dpa.geometry.semantics import NUM_CLASSES, UNKNOWN_CLASS, classes_of
 from r3dpa.geometry.sensor import EMPTY_RANGE_M
 
-_PROJECTIONS = {"spherical": SphericalProjection, "rings": RingProjection}
+_PROJECTIONS = {
+    "spherical": SphericalProjection,
+    "rings": RingProjection,
+    "beams": BeamProjection,
+}
 _ROUNDING_M = 1e-3
 _LIKELY_RETURN = 0.7
 _DEFAULT_SCALES = {"linear": 56.0, "log2": 5.84, "inverse": 1.45}
@@ -136,6 +141,15 @@ class RangeCodec:
     @property
     def _divisor(self) -> float:
         return _DEFAULT_SCALES[self.encoding] if self.scale is None else self.scale
+
+    def reaching(self, range_max_m: float) -> Self:
+        """Codec of the same encoding whose images reach this range, by default scale or more."""
+        farthest_m = self.to_range(torch.ones(())).item()
+        if self.scale is not None or self.encoding == "inverse" or farthest_m >= range_max_m:
+            return self
+        if self.encoding == "log2":
+            return replace(self, scale=math.log2(range_max_m + 1 + self.offset_m))
+        return replace(self, scale=range_max_m)
 
     @property
     def threshold(self) -> float:

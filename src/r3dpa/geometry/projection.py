@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.nn.functional import embedding_bag
 
 from lidarsim.sensors.view import LidarSensor
+from r3dpa.geometry.beams import BeamProjection
 from r3dpa.geometry.rings import RingProjection
 from r3dpa.geometry.sensor import (
     EMPTY_RANGE_M,
@@ -87,7 +88,7 @@ class SphericalProjection:
         return torch.arange(self.sensor.columns)
 
 
-Projection = SphericalProjection | RingProjection
+Projection = SphericalProjection | RingProjection | BeamProjection
 
 
 @lru_cache(maxsize=16)
@@ -105,6 +106,8 @@ def ray_directions(
     """
     # A tensor made in inference mode could never take part in a backward pass again.
     with torch.inference_mode(False):
+        if isinstance(projection, BeamProjection):
+            return projection.directions(corner).to(device=device, dtype=dtype)
         inclination, azimuth = torch.meshgrid(*projection.ray_angles(corner), indexing="ij")
         horizontal = inclination.cos()
         directions = torch.stack(
@@ -182,7 +185,28 @@ def unproject(range_m: Tensor, projection: Projection, corner: bool = False) -> 
         not positive, that is without a return. :func:`in_range` is False there.
     """
     directions = ray_directions(projection, corner, range_m.dtype, range_m.device)
+    if isinstance(projection, BeamProjection):
+        return _from_centres(range_m, directions, projection.origins(corner).to(range_m))
     return range_m.clamp(min=0).unsqueeze(-1) * directions
+
+
+def _from_centres(range_m: Tensor, directions: Tensor, origins: Tensor) -> Tensor:
+    """Points ``(..., H, W, 3)`` at these distances from the frame's origin, along their beams.
+
+    With the optical centre c and the direction u of a pixel: |c + s u| = range.
+    """
+    ahead = (origins * directions).sum(dim=-1)
+    beside = origins.square().sum(dim=-1) - ahead.square()
+    along = (range_m.square() - beside).clamp(min=0).sqrt() - ahead
+    points = origins + along.unsqueeze(-1) * directions
+    return torch.where(range_m.unsqueeze(-1) > 0, points, 0.0)
+
+
+def share_kept(points: Tensor, projection: Projection) -> float:
+    """Share of the points ``(P, 3)`` within the range limits that an image gives back."""
+    inside = in_range(points, projection.sensor)
+    range_m, _ = range_image(points, projection)
+    return int((range_m > 0).sum()) / max(int(inside.sum()), 1)
 
 
 def points_of(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any, Literal, cast
 
@@ -12,6 +12,8 @@ from torch import Tensor
 
 from r3dpa import losses
 from r3dpa.checkpoints import Checkpoint, load_into, read_checkpoint, transfer_rgb
+from r3dpa.checkpoints.image_size import resize_to
+from r3dpa.checkpoints.transfer import TransferRow
 from r3dpa.data.datasets import LidarBatch
 from r3dpa.flow import Interpolant, PerturbedAttention
 from r3dpa.flow.sampler import SamplerConfig
@@ -50,6 +52,8 @@ class GenerativeModule(Stage):
         latent_norm: Latent statistics; None makes a fresh one.
         init_from: Checkpoint of the stage before.
         init_networks: Which networks are taken from ``init_from``; None means ``default_init``.
+        init_other_sensor: Start from weights for images of another sensor: position tables and
+            stems are resized where the images have another size.
         rgb_weights: RGB-pretrained SiT, official ``.pt`` or ours, for a SiT only; None starts from
             random values.
         keep_projector: Keep the RGB model's projection head where its shape fits.
@@ -89,6 +93,7 @@ class GenerativeModule(Stage):
         seed: int = 0,
         channels_last: bool = False,
         compile: bool = False,
+        init_other_sensor: bool = False,
     ) -> None:
         if not 0 <= latent_noise <= 1:
             raise ValueError(f"latent_noise must lie in [0, 1], got {latent_noise}")
@@ -104,6 +109,7 @@ class GenerativeModule(Stage):
         self.latent_shape = (vae.latent_channels, *sit.input_size)
         self.init_from = init_from
         self.init_networks = self.default_init if init_networks is None else tuple(init_networks)
+        self.init_other_sensor = init_other_sensor
         self.rgb_weights = rgb_weights
         self.keep_projector = keep_projector
         self.channels_last = channels_last
@@ -193,14 +199,17 @@ class GenerativeModule(Stage):
                 )
             rgb = read_checkpoint(self.rgb_weights)
             rows = transfer_rgb(rgb, self.sit, self.latent_norm, self.keep_projector)
-            heads = ("weights", "tensors", "result", "reason")
-            table = text_table([tuple(map(str, row)) for row in rows], heads)
-            rank_zero_info(f"RGB weights from {self.rgb_weights}\n{table}")
+            rank_zero_info(f"RGB weights from {self.rgb_weights}\n{_table(rows)}")
         if self.init_from is not None:
-            before = self.previous_networks(read_checkpoint(self.init_from))
+            given = read_checkpoint(self.init_from)
+            before = self.previous_networks(given)
             networks = {name: self.get_submodule(name) for name in self.init_networks}
+            if self.init_other_sensor:
+                before, rows = resize_to(networks, before, given)
+                rank_zero_info(f"weights of another sensor from {self.init_from}\n{_table(rows)}")
+            else:
+                self._previous_geometry = before.geometry
             load_into(networks, before, stage=self.stage)
-            self._previous_geometry = before.geometry
         if self.ema is not None:
             self.ema.reset(self.sit, self.latent_norm)
         self._has_weights = True
@@ -419,6 +428,11 @@ class GenerativeModule(Stage):
         """Refuse the checkpoint of another stage or of other range images."""
         super().on_load_checkpoint(checkpoint)
         self._has_weights = True
+
+
+def _table(rows: Sequence[TransferRow]) -> str:
+    heads = ("weights", "tensors", "result", "reason")
+    return text_table([tuple(map(str, row)) for row in rows], heads)
 
 
 def check_image(vae: VAE, codec: RangeCodec) -> None:

@@ -104,7 +104,7 @@ class FlowMatching(GenerativeModule):
             self,
             Path(self.latents_dir or Path(self.trainer.default_root_dir) / "latents"),
             {"projection": geometry["projection"], "codec": geometry["codec"]},
-            dataset.scans,
+            list(dict.fromkeys(dataset.scans)),
             lambda scans: replace(dataset, scans=scans, grids=None),
             "range_image",
         )

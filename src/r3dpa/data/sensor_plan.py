@@ -1,0 +1,234 @@
+"""Plan of fine-tuning ``r3dpa-s`` on the scans of a sensor: data, sizes, steps and simulated scans.
+
+``r3dpa data plan`` writes it as YAML files for the commands of ``make my-sensor``.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+import yaml
+
+from lidarsim import Simulator
+from lidarsim.scan_files import read_scan
+from lidarsim.sensors import SpinningLidar, load_sensor
+from r3dpa.data.datamodules import LidarDataModule
+from r3dpa.data.scans import Scan, evenly
+from r3dpa.geometry import BeamProjection, share_kept
+from r3dpa.io import write_text
+
+MOST_SIMULATED, FEWEST_SIMULATED = 2000, 32
+# Measured on two idle cores, for ten minutes in all: shares of the time, and steps of the stages.
+_SIMULATION_SHARE, _VAE_STEPS, _FLOW_STEPS = 0.2, 160, 200
+_VAE_SHARE, _FLOW_SHARE = 0.35, 0.4  # after which a stage stops, on slow machines
+_LATENTS = (8, 64)  # rows and columns of r3dpa-s, which the stem makes of any image
+_STRIDE = 2  # of its VAE beyond the stem, in both directions
+_GRID = (8, 32)
+_FEWEST_HELD_OUT, _HELD_OUT_SHARE = 2, 5  # of which a comparison consists; every fifth scan
+_USER_SHARE = 1 / 3  # of the training scans of an epoch
+_EVERY = 20  # simulated scans of a drive are 2 s apart
+_TIMED_SCANS = 3
+_MOST_CHECKED = 8  # scans, whose share of points in the image is measured
+
+
+class Split(NamedTuple):
+    """Number of scans to train on and held out, and the stride of the latter."""
+
+    num_train: int
+    num_held_out: int
+    val_every: int
+
+
+@dataclass(frozen=True)
+class SensorPlan:
+    """What a run of ``make my-sensor`` does.
+
+    Args:
+        sensor: Preset or YAML file of the sensor.
+        scans: Folder of its scans.
+        projection: Range images.
+        split: Scans to train on and to compare with.
+        kept: Mean share of the points of the scans that the images hold.
+        seconds_per_scan: Time to simulate a scan on one core.
+        num_simulated: Scans to simulate.
+        minutes: Time for everything.
+        workers: Processes.
+    """
+
+    sensor: str
+    scans: str
+    projection: BeamProjection
+    split: Split
+    kept: float
+    seconds_per_scan: float
+    num_simulated: int
+    minutes: float
+    workers: int
+
+    @classmethod
+    def of(
+        cls, sensor: str, scans: str, minutes: float, columns: int = 1024, workers: int = 2
+    ) -> SensorPlan:
+        """Plan for the scans of a folder; simulates a few scans to measure the machine.
+
+        Raises:
+            ValueError: If there are too few scans, or images cannot have so many columns.
+        """
+        divisor = _LATENTS[1] * _STRIDE
+        if columns % divisor:
+            raise ValueError(f"columns must be a multiple of {divisor}, got {columns}")
+        lidar = load_sensor(sensor)
+        projection = BeamProjection.for_networks(lidar, columns)
+        module = LidarDataModule(scans, sensor=sensor, image_columns=columns, val_every=None)
+        all_scans = module.split()[0]
+        split = split_of(len(all_scans), scans)
+        seconds = _seconds_per_scan(lidar)
+        fitting = int(60 * _SIMULATION_SHARE * minutes * workers / seconds)
+        num_simulated = min(MOST_SIMULATED, max(FEWEST_SIMULATED, fitting))
+        kept = _mean_share_kept(evenly(all_scans, _MOST_CHECKED), projection)
+        return cls(sensor, scans, projection, split, kept, seconds, num_simulated, minutes, workers)
+
+    @property
+    def stem(self) -> tuple[int, int]:
+        """Rows and columns of a block of pixels, such that latents have the size of r3dpa-s."""
+        size = (self.projection.sensor.beams, self.projection.sensor.columns)
+        return size[0] // (_LATENTS[0] * _STRIDE), size[1] // (_LATENTS[1] * _STRIDE)
+
+    @property
+    def repeats(self) -> int:
+        """How often a scan of the user occurs per epoch: a third of it, all together."""
+        wanted = self.num_simulated * _USER_SHARE / (1 - _USER_SHARE)
+        return max(1, round(wanted / self.split.num_train))
+
+    def steps(self, in_ten_minutes: int) -> int:
+        """Steps of a stage, in proportion to the time."""
+        return max(8, round(in_ten_minutes * self.minutes / 10))
+
+    def files(self, out: Path) -> dict[str, dict[str, Any]]:
+        """YAML files by name: data, both stages, and the simulation below the folder ``out``."""
+        data = {
+            "scans": self.scans,
+            "sensor": self.sensor,
+            "image_columns": self.projection.sensor.columns,
+            "codec": {"encoding": "log2", "return_channel": True},
+            "grid_size": list(_GRID),
+            "extractor": None,
+            "val_every": self.split.val_every,
+            "further_scans": str(out / "simulated"),
+            "repeats": self.repeats,
+            "num_workers": self.workers,
+        }
+        return {
+            "data": {"data": {"class_path": "r3dpa.data.LidarDataModule", "init_args": data}},
+            "vae": self._stage(_VAE_STEPS, _VAE_SHARE, {"init_other_sensor": True}),
+            "flow": self._stage(_FLOW_STEPS, _FLOW_SHARE, {})
+            | {"data": {"init_args": {"augmentation": {"rotate": True}}}},
+            "simulate": {
+                "scans": self.num_simulated,
+                "sensor": self.sensor,
+                "every": _EVERY,
+                "workers": self.workers,
+            },
+        }
+
+    def write(self, out: Path) -> None:
+        """Write :meth:`files`, and what more time would add."""
+        for name, content in self.files(out).items():
+            text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
+            write_text(out / f"{name}.yaml", text)
+        write_text(out / "more.txt", self.more + "\n")
+
+    def _stage(
+        self, in_ten_minutes: int, share: float, init_args: dict[str, Any]
+    ) -> dict[str, Any]:
+        steps = self.steps(in_ten_minutes)
+        every = max(1, min(steps // 2, 50))
+        model = {
+            "vae": {"init_args": {"stem": list(self.stem)}},
+            "optimizer": {"warmup_steps": 5, "decay_steps": steps // 2},
+        }
+        return {
+            "model": {"init_args": model | init_args},
+            "trainer": {
+                "max_steps": steps,
+                "max_time": {"seconds": math.ceil(60 * share * self.minutes)},
+                "val_check_interval": steps,
+                "limit_val_batches": 2,
+            },
+            "checkpoint": {"every_n_train_steps": every},
+        }
+
+    def __str__(self) -> str:
+        sensor, split = self.projection.sensor, self.split
+        simulated = f"{self.num_simulated} scans to simulate, {self.seconds_per_scan:.2f} s each"
+        if self.num_simulated < MOST_SIMULATED:
+            simulated += f" on a core: {MOST_SIMULATED} would take longer than the time allows"
+        reach = f"{sensor.range_min_m:g} to {sensor.range_max_m:g} m"
+        return "\n".join(
+            [
+                f"image: {sensor.beams} x {sensor.columns}, {reach}, one row per beam; "
+                f"it holds {self.kept:.1%} of the points of a scan",
+                f"scans: {split.num_train} to train on, {split.num_held_out} held out",
+                simulated,
+                f"{self._steps_text}, fewer where the time ends before",
+            ]
+        )
+
+    @property
+    def _steps_text(self) -> str:
+        return f"{self.steps(_VAE_STEPS)} steps of the VAE, {self.steps(_FLOW_STEPS)} of the SiT"
+
+    @property
+    def more(self) -> str:
+        """What an hour or a GPU would add."""
+        return (
+            f"Planned for {self.minutes:g} minutes on two idle cores: {self.num_simulated} scans, "
+            f"{self._steps_text}; a slower machine stops a stage before its last step.\n"
+            "make my-sensor MINUTES=60 takes six times as many steps as ten minutes, and up to "
+            f"{MOST_SIMULATED} scans.\n"
+            "A GPU takes the steps that r3dpa-s was trained with in about an hour: 5252 of 64 "
+            "scans and 6790 of 256.\n"
+            "More scans of your own, from other drives, make the scores after it more reliable: "
+            f"they compare with {self.split.num_held_out} held-out scans."
+        )
+
+
+def split_of(num_scans: int, where: str) -> Split:
+    """Hold out every fifth scan, but at least two.
+
+    Raises:
+        ValueError: If that leaves none to train on.
+    """
+    if num_scans <= _FEWEST_HELD_OUT:
+        raise ValueError(
+            f"{where}: holds {num_scans} scans of at least {_FEWEST_HELD_OUT + 1}, since "
+            f"{_FEWEST_HELD_OUT} are held out to compare with; with fewer, give `r3dpa fit` the "
+            "sensor and simulated scans alone"
+        )
+    num_held_out = max(_FEWEST_HELD_OUT, num_scans // _HELD_OUT_SHARE)
+    val_every = math.ceil(num_scans / num_held_out)
+    num_held_out = len(range(0, num_scans, val_every))
+    return Split(num_scans - num_held_out, num_held_out, val_every)
+
+
+def _seconds_per_scan(lidar: SpinningLidar) -> float:
+    """Time to simulate a scan, without the first one, which also builds the street."""
+    simulator = Simulator(sensor=lidar)
+    simulator.scan(0)
+    started = time.perf_counter()
+    for number in range(1, 1 + _TIMED_SCANS):
+        simulator.scan(number * _EVERY)
+    return (time.perf_counter() - started) / _TIMED_SCANS
+
+
+def _mean_share_kept(scans: list[Scan], projection: BeamProjection) -> float:
+    shares = []
+    for scan in scans:
+        points = torch.from_numpy(read_scan(scan.path, projection.sensor)[:, :3])
+        shares.append(share_kept(points, projection))
+    return sum(shares) / len(shares)
