@@ -89,7 +89,7 @@ def test_halo_of_weak_sheeting_shrinks_with_range():
     """Below saturation the chance goes with the root of the power, as 1 / R; above it is 1."""
 
     def points_of_halo(distance_m, retroreflection):
-        scene = Scene((sheet(distance_m, 0, 0.02 * distance_m),), ground_reflectivity=1e-3)
+        scene = Scene((sheet(distance_m, 0, 0.05 * distance_m),), ground_reflectivity=1e-3)
         sweep = swept(scene, [RetroReflection(retroreflection)])
         return halo_counts(sweep, 60, Blooming(spill=1.0)).sum()
 
@@ -99,7 +99,9 @@ def test_halo_of_weak_sheeting_shrinks_with_range():
 
 def test_halo_has_the_range_of_the_sheet_and_no_label():
     scene = Scene((sheet(15, 5, 0.4),))
-    plain = dict.fromkeys(("range_noise", "laser_calibration", "surface_texture"), "off")
+    plain = dict.fromkeys(
+        ("range_noise", "laser_calibration", "surface_texture", "weak_patches"), "off"
+    )
     scan = simulate_scan(scene, SENSOR, (4,), plain)
     halo, sheeting = (scan.origins == Origin.BLOOMING), (scan.labels & 0xFFFF) == Semantic.SIGN
     assert halo.sum() > 3
@@ -107,8 +109,8 @@ def test_halo_has_the_range_of_the_sheet_and_no_label():
     range_m = np.linalg.norm(scan.points[:, :3], axis=1)
     assert range_m[sheeting].min() - 0.02 < range_m[halo].min()
     assert range_m[halo].max() < range_m[sheeting].max() + 0.02
-    # sqrt(0.002 * 220), a little less off the sheet's normal.
-    assert np.median(scan.points[halo, 3]) == pytest.approx(0.62, abs=0.08)
+    # sqrt(0.002 * 220), a little less off the sheet's normal, and less beside its rim.
+    assert scan.points[halo, 3].max() == pytest.approx(0.62, abs=0.08)
 
 
 def test_halo_runs_across_the_end_of_the_turn():

@@ -10,7 +10,7 @@ from lidarsim import Lasers, Scene, hdl64e, load_sensor, simulate_scan
 def test_two_blocks_with_the_beams_of_kitti():
     lasers = hdl64e().lasers
     degrees = np.degrees(lasers.inclination_rad)
-    np.testing.assert_allclose(degrees[[0, 31, 32, 63]], [1.94, -8.71, -9.03, -25.0], atol=1e-9)
+    np.testing.assert_allclose(degrees[[0, 31, 32, 63]], [1.94, -8.71, -9.03, -25.0], atol=0.005)
     steps = -np.diff(degrees)
     assert (steps > 0).all()
     # Standard deviation of 31 normal draws: within 3 standard errors (13 % each).

@@ -86,7 +86,7 @@ class SpinningLidar:
     threshold_spread: float = 0.3  # standard deviation of the logarithm of the threshold
     lost_share: float = 0.001  # of shots at the ground that are lost, see ``effects.instrument``
     weak_share: float = 0.0  # of the echoes that are barely detected, see ``effects.surface``
-    range_sigma_m: float = 0.0065  # range noise of a strong return
+    range_sigma_m: float = 0.0068  # range noise of a strong return
     weak_range_sigma_m: float = 0.05  # further noise at a signal-to-noise ratio of 1/2
     range_step_m: float = 0.002  # in which ranges are reported; 0 for none
     return_mode: Literal["strongest", "dual"] = "strongest"  # or the two strongest of a shot

@@ -18,7 +18,7 @@ SCAN_PERIOD_S = 0.1
 
 _CAMBER = 0.02
 # Lanes and pavements of German residential streets.
-_LANE_M, _PAVEMENT_M = (2.75, 3.25), (1.5, 3.0)
+_LANE_M, _PAVEMENT_M = (2.75, 3.25), (1.5, 3.1)
 _GUTTER_M = (0.5, 0.9)
 _PARKING_M = 2.1
 # Bins are emptied on one working day of five.
@@ -64,12 +64,12 @@ _TOWN = Character(
 )  # fmt: skip
 _ROW_HOUSES = Character(
     lanes=((1, 1), (1, 0)), districts=(0.1, 0.55, 0.2, 0.1, 0.05, 0.0, 0.0),
-    parked=(0.14, 0.45), parking=0.8, pavement=0.95, clutter=1.4, people=0.15, lights=False,
+    parked=(0.14, 0.45), parking=0.8, pavement=0.95, clutter=1.2, people=0.15, lights=False,
     island=0.1, car_gap_m=(60, 140), people_gap_m=(50, 140), crossing_every=(4, 8), slope=0.02,
 )  # fmt: skip
 _SUBURB = Character(
     lanes=((1, 1), (1, 0)), districts=(0.05, 0.15, 0.65, 0.05, 0.1, 0.0, 0.0),
-    parked=(0.1, 0.41), parking=0.75, pavement=0.95, clutter=1.25, people=0.15, lights=False,
+    parked=(0.1, 0.41), parking=0.75, pavement=0.95, clutter=1.0, people=0.15, lights=False,
     island=0.1, car_gap_m=(60, 140), people_gap_m=(60, 160), crossing_every=(4, 8), slope=0.025,
 )  # fmt: skip
 _GREEN = Character(
