@@ -21,7 +21,7 @@ from lidarsim.sweep import Effect, Origin, Sweep
 # logarithm of the density of leaves.
 _CLUMP_RAYS, _CLUMP_SPREAD = ((0.7, 1.2), (2.0, 6.0)), 0.7
 # Correlation of a ray's own depth with the field of the clumps.
-_ALIKE = 0.9
+_ALIKE = 0.94
 
 
 class RollingShutter(Effect):

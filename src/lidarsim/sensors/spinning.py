@@ -84,7 +84,7 @@ class SpinningLidar:
     pulse_s: float = 5e-9  # echoes nearer to each other than ``pulse_depth_m`` merge
     overlap_range_m: float = 5.0  # from here on the receiver sees the whole beam
     threshold_spread: float = 0.3  # standard deviation of the logarithm of the threshold
-    lost_share: float = 0.001  # of shots at the ground that are lost, see ``effects.instrument``
+    lost_share: float = 0.0009  # of shots at the ground that are lost, see ``effects.instrument``
     weak_share: float = 0.0  # of the echoes that are barely detected, see ``effects.surface``
     range_sigma_m: float = 0.0068  # range noise of a strong return
     weak_range_sigma_m: float = 0.05  # further noise at a signal-to-noise ratio of 1/2

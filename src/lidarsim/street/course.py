@@ -18,7 +18,7 @@ SCAN_PERIOD_S = 0.1
 
 _CAMBER = 0.02
 # Lanes and pavements of German residential streets.
-_LANE_M, _PAVEMENT_M = (2.75, 3.25), (1.5, 3.1)
+_LANE_M, _PAVEMENT_M = (2.75, 3.25), (1.6, 3.2)
 _GUTTER_M = (0.5, 0.9)
 _PARKING_M = 2.1
 # Bins are emptied on one working day of five.
@@ -64,17 +64,17 @@ _TOWN = Character(
 )  # fmt: skip
 _ROW_HOUSES = Character(
     lanes=((1, 1), (1, 0)), districts=(0.1, 0.55, 0.2, 0.1, 0.05, 0.0, 0.0),
-    parked=(0.14, 0.45), parking=0.8, pavement=0.95, clutter=1.2, people=0.15, lights=False,
+    parked=(0.21, 0.57), parking=0.8, pavement=0.95, clutter=1.7, people=0.15, lights=False,
     island=0.1, car_gap_m=(60, 140), people_gap_m=(50, 140), crossing_every=(4, 8), slope=0.02,
 )  # fmt: skip
 _SUBURB = Character(
     lanes=((1, 1), (1, 0)), districts=(0.05, 0.15, 0.65, 0.05, 0.1, 0.0, 0.0),
-    parked=(0.1, 0.41), parking=0.75, pavement=0.95, clutter=1.0, people=0.15, lights=False,
+    parked=(0.18, 0.54), parking=0.75, pavement=0.95, clutter=1.6, people=0.15, lights=False,
     island=0.1, car_gap_m=(60, 140), people_gap_m=(60, 160), crossing_every=(4, 8), slope=0.025,
 )  # fmt: skip
 _GREEN = Character(
     lanes=((1, 1),), districts=(0.05, 0.05, 0.15, 0.1, 0.55, 0.1, 0.0),
-    parked=(0.07, 0.3), parking=0.4, pavement=0.6, clutter=0.3, people=0.05, lights=False,
+    parked=(0.15, 0.45), parking=0.4, pavement=0.6, clutter=0.3, people=0.05, lights=False,
     island=0.2, car_gap_m=(60, 140), people_gap_m=(80, 200), crossing_every=(6, 10), slope=0.025,
 )  # fmt: skip
 _ARTERIAL = Character(
