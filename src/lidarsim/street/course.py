@@ -74,7 +74,7 @@ _SUBURB = Character(
 )  # fmt: skip
 _GREEN = Character(
     lanes=((1, 1),), districts=(0.05, 0.05, 0.15, 0.1, 0.55, 0.1, 0.0),
-    parked=(0.15, 0.45), parking=0.4, pavement=0.6, clutter=0.3, people=0.05, lights=False,
+    parked=(0.17, 0.48), parking=0.4, pavement=0.6, clutter=0.3, people=0.05, lights=False,
     island=0.2, car_gap_m=(60, 140), people_gap_m=(80, 200), crossing_every=(6, 10), slope=0.025,
 )  # fmt: skip
 _ARTERIAL = Character(
@@ -84,7 +84,7 @@ _ARTERIAL = Character(
 )  # fmt: skip
 _COUNTRY = Character(
     lanes=((1, 1),), districts=(0.0, 0.0, 0.2, 0.0, 0.3, 0.05, 0.45),
-    parked=(0.03, 0.22), parking=0.15, pavement=0.3, clutter=0.2, people=0.03, lights=False,
+    parked=(0.12, 0.5), parking=0.2, pavement=0.3, clutter=0.4, people=0.03, lights=False,
     island=0.2, car_gap_m=(60, 160), people_gap_m=(120, 300), crossing_every=(8, 12), slope=0.025,
 )  # fmt: skip
 
