@@ -224,7 +224,9 @@ class TestObjects:
         assert "4 scans" in text
 
     def test_an_object_library_of_another_format_is_refused(self, simulated, tiny_file, tmp_path):
-        with pytest.raises(ValueError, match=r"\.safetensors file, got .*objects\.npz"):
+        with pytest.raises(
+            ValueError, match=r"\.safetensors or \.objects file, got .*objects\.npz"
+        ):
             objects(data=str(simulated), ckpt=tiny_file, out=tmp_path / "objects.npz")
 
 

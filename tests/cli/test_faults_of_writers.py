@@ -59,7 +59,7 @@ def jobs(scans_folder, tmp_path_factory):
         ),
         "reference": Job(
             ["reference", "--data", folder / "data.yaml", "--spaces", "fgeo", "--device", "cpu"],
-            At("r3dpa.data.datamodules.read_scan", None, call=4),
+            At("r3dpa.data.scans.read_scan", None, call=4),
             is_file=True,
         ),
     }
@@ -130,7 +130,7 @@ def test_a_command_stopped_by_sigterm_goes_on(name, jobs, ended, out_of, goes_on
     out = out_of(name)
     stop = at(jobs[name], partial(signal.raise_signal, signal.SIGTERM))
     status, seen = ended(jobs[name].command(out), stop)
-    assert status == 130
+    assert status == 130, seen
     assert seen.endswith(f"r3dpa {name}: stopped; the same command continues\n")
     assert "Traceback" not in seen
     assert_whole(out.parent)

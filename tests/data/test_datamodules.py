@@ -225,11 +225,6 @@ def test_bad_arguments_are_refused(data, options, message):
         data(**options)
 
 
-def test_a_sensor_by_its_name_is_refused():
-    with pytest.raises(ValueError, match=r"sensor must be a LidarSensor .* got 'hdl32e'"):
-        LidarDataModule(scans="scans", sensor="hdl32e")
-
-
 def test_simulated_data_are_made_once_and_feed_a_fit(tmp_path, scaled_points, fit):
     extractor = scaled_points()
     for _ in range(2):

@@ -8,8 +8,7 @@ from lightning import Trainer
 from point_clouds import GRID, cloud
 from tiny_stages import SILENT
 
-from r3dpa.data import LidarDataModule, write_bin
-from r3dpa.data.datamodules import PointDataModule
+from r3dpa.data import LidarDataModule, PointDataModule, write_bin
 from r3dpa.data.datasets import DrawnPoints
 from r3dpa.features import Masking, WaffleIron, WaffleIronS, collate_scans
 from r3dpa.modules import PointPretraining

@@ -18,7 +18,7 @@ from r3dpa.bench.training import (
     StageCost,
     StepSettings,
     measure_steps,
-    silence_lightning,
+    quiet_lightning,
 )
 from r3dpa.callbacks import EMASnapshots
 from r3dpa.data.datamodules import LidarDataModule, SimulatedDataModule
@@ -96,8 +96,10 @@ class DryRun:
 
     def _measure(self, settings: StepSettings) -> StageCost:
         module, data = cast(GenerativeModule, self.module), cast(LidarDataModule, self.data)
-        silence_lightning()
-        with tempfile.TemporaryDirectory(prefix="r3dpa_dry_run_") as folder:
+        with (
+            tempfile.TemporaryDirectory(prefix="r3dpa_dry_run_") as folder,
+            quiet_lightning(),
+        ):
             simulate(Path(folder) / "scans", scans=settings.batch_size)
             scans = LidarDataModule(
                 str(Path(folder) / "scans"),

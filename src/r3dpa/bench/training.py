@@ -8,9 +8,10 @@ import math
 import tempfile
 import time
 import warnings
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from multiprocessing import get_context
 from pathlib import Path
@@ -148,7 +149,7 @@ def _in_new_process(
     stage: str, files: list[Path], folder: Path, settings: StepSettings
 ) -> StageCost:
     # spawn: a forked process would share memory with this one.
-    with ProcessPoolExecutor(1, get_context("spawn"), silence_lightning) as pool:
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
         try:
             return pool.submit(_measure, stage, files, folder, settings).result()
         except BrokenProcessPool as error:
@@ -159,17 +160,26 @@ def _in_new_process(
             ) from error
 
 
-def silence_lightning() -> None:
+@contextmanager
+def quiet_lightning() -> Iterator[None]:
     """Hide hints about loaders and loggers, which do not apply to a benchmark."""
-    warnings.filterwarnings("ignore", module="lightning")
-    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    logger = logging.getLogger("lightning.pytorch")
+    level = logger.level
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", module="lightning")
+        logger.setLevel(logging.WARNING)
+        try:
+            yield
+        finally:
+            logger.setLevel(level)
 
 
 def _measure(stage: str, files: list[Path], folder: Path, settings: StepSettings) -> StageCost:
     L.seed_everything(0, verbose=False)
     module = _build(files, folder / f"{stage}.safetensors")
     data = _data(module, folder, stage, settings.batch_size)
-    return measure_steps(module, data, settings)
+    with quiet_lightning():
+        return measure_steps(module, data, settings)
 
 
 def measure_steps(
