@@ -4,6 +4,7 @@ import json
 import shutil
 import subprocess
 import sys
+import time
 
 import pytest
 
@@ -244,9 +245,11 @@ def test_the_bar_of_a_fit_shows_losses_and_no_notices_remain(fitted):
 def test_a_fit_logs_its_configuration_to_wandb(fitted):
     run_dir, _ = fitted
     (run,) = run_dir.glob("wandb/offline-run-*/run-*.wandb")
-    content = run.read_bytes()
+    until = time.monotonic() + 30  # wandb's own process writes the file
+    while b"train/reconstruction" not in (content := run.read_bytes()):
+        assert time.monotonic() < until
+        time.sleep(0.1)
     assert b"r3dpa.modules.VAEAlignment" in content
-    assert b"train/reconstruction" in content
 
 
 def test_a_fit_that_is_refused_leaves_no_wandb_run(smoke_args, tmp_path):
