@@ -347,7 +347,7 @@ def _close_pairs(
     pairs = []
     for first in range(0, len(order), _BLOCK_RAYS):
         block = order[first : first + _BLOCK_RAYS]
-        longest_m = reach_m[block].max()
+        longest_m = float(reach_m[block].max())
         some = _near_block(centre, radius, origin[:2, block], along[:, block], longest_m)
         ray, index = _places(np.abs(sides[block] @ places[:, some]) <= radius[some])
         pairs.append((block[ray], some[index]))
@@ -370,7 +370,7 @@ def _close_pairs(
 
 
 def _near_block(
-    centre: Floats, radius: Floats, origin: Floats, along: Floats, longest_m: Floats
+    centre: Floats, radius: Floats, origin: Floats, along: Floats, longest_m: float
 ) -> NDArray[np.int64]:
     """Circles (of N) within the cone around all of a block's rays, seen from above.
 

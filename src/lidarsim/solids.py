@@ -234,7 +234,7 @@ def _windows_from(
     heading = np.arctan2(centre[:, 1], centre[:, 0])
     angle = np.arctan2(corner_y, corner_x) - heading[:, None]
     angle = (angle + np.pi) % (2 * np.pi) - np.pi
-    # A corner at the distance d moves by at most asin(spread / d).
+    # A ray that starts elsewhere sees a corner at the distance d by at most asin(spread / d) aside.
     around = near_m <= _LEAST_GAP * spread_m
     spread_rad = np.arcsin(np.where(around, 1.0, spread_m / np.where(around, 1.0, near_m)))
     near_m = (near_m - spread_m).clip(min=0)

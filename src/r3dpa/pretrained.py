@@ -11,8 +11,8 @@ from r3dpa.io import first_line, text_table
 
 DEFAULT_WEIGHTS = "r3dpa-s"
 """Name of the weights that commands use without ``--ckpt``."""
+#: Suffix of the file of mean features per object class, beside the weights of the same name.
 OBJECTS_SUFFIX = ".objects"
-"""Of the file of mean features of object classes beside the weights of the same name."""
 _FOLDER = Path(__file__).parent / "weights"
 _HUB = "hf:/"  # a Path joins the two slashes of hf://
 

@@ -5,7 +5,12 @@ import torch
 from torch import nn
 
 from lidarsim import Simulator
-from r3dpa.data import LabelledPointDataModule, SimulatedDataModule, SimulatedImageDataModule
+from r3dpa.data import (
+    LabelledPointDataModule,
+    PointDataModule,
+    SimulatedDataModule,
+    SimulatedImageDataModule,
+)
 from r3dpa.features import Masking, ScanGrid
 from r3dpa.geometry import (
     NUM_CLASSES,
@@ -158,6 +163,19 @@ def test_points_and_classes_of_a_labelled_image_train_a_network_on_points(tmp_pa
     torch.testing.assert_close(
         masked.scan.features[:, 0] * std + mean, pixels.intensity[seen][kept]
     )
+
+
+def test_points_of_cached_images_lie_along_the_beams_of_a_named_sensor(tmp_path):
+    settings = {"sensor": "vlp16", "image_columns": 128, "codec": LABELLED, "num_scans": 2}
+    source = module(tmp_path, **settings, extractor=None)
+    source.prepare_data()
+    data = PointDataModule(source, lambda points, generator: points)
+    data.setup("fit")
+    points = torch.as_tensor(data.train_set[0])
+    torch.testing.assert_close(points[:, :3], source.points(data.train_set.scans[0]))
+    inclination = torch.asin(points[:, 2] / points[:, :3].norm(dim=1)).rad2deg()
+    steps = inclination[points[:, :3].norm(dim=1) > 20] % 2  # of VLP-16: odd degrees
+    assert (steps - 1).abs().max() < 0.2
 
 
 def test_networks_on_points_need_images_with_intensity(tmp_path):

@@ -67,6 +67,8 @@ def library(tmp_path, scaled_points):
 class _Images:
     """One image: cars in the front half, road in the back half."""
 
+    projection = PROJECTION
+
     def read(self, scan):
         classes = torch.full((4, 8), 11)
         classes[:, :2] = classes[:, 6:] = 0

@@ -195,6 +195,24 @@ def test_windows_never_cut_a_solid(monkeypatch, seed, moving):
         (x, y, z), cosine, sine = rays.direction, np.cos(turn), np.sin(turn)
         direction = np.stack([cosine * x - sine * y, sine * x + cosine * y, z])
         rays, motion = Rays(rays.origin + shift, direction), {"actor_time_s": sensor.time_s}
+    assert_windows_cut_nothing(monkeypatch, scene, rays, **motion)
+
+
+@pytest.mark.parametrize(("speed_m_s", "aside_m"), [(30, 3), (40, 2.5)])  # the latter: all around
+def test_windows_follow_a_sensor_that_moves_while_it_sees_a_wall(monkeypatch, speed_m_s, aside_m):
+    """All beams of a column fire at once, so that nothing but the path widens the windows."""
+    places = [(x, y, 1) for x in (-4, 0, 4) for y in (-aside_m, aside_m)]
+    walls = [solid(Shape.BOX, place, (1.6, 0.1, 1)) for place in places]
+    lasers = replace(hdl64e().lasers, azimuth_offset_rad=(0.0,) * 64)
+    sensor = replace(hdl64e(shots=1440), lasers=lasers)
+    shift = np.stack([speed_m_s * sensor.time_s, 0 * sensor.time_s, 0 * sensor.time_s])
+    rays = Rays(sensor.rays.origin + shift, sensor.rays.direction)
+    scene = Scene(tuple(walls), Pose(z_m=1.7))
+    assert_windows_cut_nothing(monkeypatch, scene, rays)
+
+
+def assert_windows_cut_nothing(monkeypatch, scene, rays, **motion):
+    """Every ray meets what it meets when all rays are tested against all solids."""
     windowed = Hits(scene, rays, **motion)
 
     def everything(solids, origin, direction, max_range_m, actor_time_s=None):

@@ -98,7 +98,7 @@ def test_an_effect_can_be_switched_off_and_on():
 
 def test_intensity_rises_with_the_root_of_the_reflectivity_and_weak_returns_have_none():
     min_power = 1e-5
-    weakest, strong = min_power * np.array([module._ZERO_INTENSITY, module._FULL_INTENSITY])
+    weakest, strong = 4 * min_power, 8 * min_power
     middle = np.sqrt(weakest * strong)
     power = np.float32([25 * strong, weakest, 1.0, strong, middle])
     range_m = np.sqrt(0.09 / power)

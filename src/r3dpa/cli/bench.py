@@ -169,7 +169,7 @@ def _find_tables(tables: Path) -> Path:
         path = shipped(f"{tables}.yaml")
     if not path.exists():
         known = sorted(table.stem for table in (conf_folder() / "ablation").glob("*.yaml"))
-        near = suggestion(tables.stem, known).replace("mean ", "mean conf/ablation/")
+        near = suggestion(tables.stem, known, "conf/ablation/")
         raise ValueError(
             f"{tables}: no table or folder of tables{near}; choose from conf/ablation (all tables) "
             f"and its {', '.join(known)}, or give a YAML of that kind"

@@ -161,14 +161,17 @@ def _check_trainer_option(command: str, option: str) -> None:
     if group == "--trainer" and name:
         known = ["help", *_trainer_arguments()]
         if not any(argument.startswith(name) for argument in known):
-            near = suggestion(name, known).replace("mean ", "mean --trainer.")
+            near = suggestion(name, known, "--trainer.")
             _refuse(command, f"unknown option {option}{near}")
 
 
 def _trainer_arguments() -> list[str]:
     """Arguments of Lightning's trainer, from its source: its import takes seconds."""
-    (package,) = find_spec("lightning").submodule_search_locations  # type: ignore[union-attr, misc]
-    tree = ast.parse(Path(package, "pytorch", "trainer", "trainer.py").read_text(encoding="utf-8"))
+    package = find_spec("lightning")
+    assert package is not None
+    assert package.origin is not None
+    source = Path(package.origin).with_name("pytorch") / "trainer" / "trainer.py"
+    tree = ast.parse(source.read_text(encoding="utf-8"))
     (trainer,) = (node for node in tree.body if isinstance(node, ast.ClassDef))
     functions = [node for node in trainer.body if isinstance(node, ast.FunctionDef)]
     (init,) = (function for function in functions if function.name == "__init__")

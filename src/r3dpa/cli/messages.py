@@ -16,10 +16,13 @@ ALLOWED_PACKAGES = ("r3dpa", "lidarsim", "lightning", "torch.nn", "torch.optim")
 _REQUIRED, _UNKNOWN = "the following arguments are required: ", "unrecognized arguments: "
 
 
-def suggestion(name: str, known: Iterable[str]) -> str:
-    """Return `` (did you mean ...?)`` with the nearest known name, or nothing if none is near."""
+def suggestion(name: str, known: Iterable[str], prefix: str = "") -> str:
+    """Return `` (did you mean ...?)`` with the nearest known name, or nothing if none is near.
+
+    ``prefix`` stands before that name, and does not count when names are compared.
+    """
     nearest = get_close_matches(name, list(known), n=1)
-    return f" (did you mean {nearest[0]}?)" if nearest else ""
+    return f" (did you mean {prefix}{nearest[0]}?)" if nearest else ""
 
 
 def describe_error(

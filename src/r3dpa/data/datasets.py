@@ -23,7 +23,6 @@ from r3dpa.geometry import (
     Pixels,
     Projection,
     RangeCodec,
-    SphericalProjection,
     in_range,
     points_of,
     project_pixels,
@@ -59,6 +58,10 @@ class LidarBatch(TypedDict):
 
 class CachedImages(Protocol):
     """Images that scans are read from, safe to hand to loader processes."""
+
+    @property
+    def projection(self) -> Projection:
+        """Projection that the images were made with."""
 
     def read(self, scan: Any, /) -> Pixels:
         """Pixels ``(H, W)`` of a scan."""
@@ -177,7 +180,9 @@ class DrawnPoints(PointDataset):
         if self.images is None:
             read = self.scans[index].read(self.sensor)
         else:
-            read = points_at_pixels(self.images.read(self.scans[index]), self.sensor).numpy()
+            read = points_at_pixels(
+                self.images.read(self.scans[index]), self.images.projection
+            ).numpy()
         if self.weather is not None and isinstance(key, tuple):
             read = self.weather.points(read, (self.seed, epoch, index))
             if not in_range(torch.from_numpy(read[:, :3]), self.sensor).any():
@@ -204,19 +209,18 @@ class LabelledPoints(DrawnPoints):
             pixels = self.images.read(scan)
             if pixels.classes is None:
                 return None
-            projection = SphericalProjection(self.sensor)
-            return values_at_returns(pixels.classes, pixels.range_m, projection)
+            return values_at_returns(pixels.classes, pixels.range_m, self.images.projection)
         labels = find_labels(scan.path, num_points)
         # The upper bits of a label are the object.
         return None if labels is None else classes_of(torch.from_numpy(labels & 0xFFFF))
 
 
-def points_at_pixels(pixels: Pixels, sensor: LidarSensor) -> Tensor:
+def points_at_pixels(pixels: Pixels, projection: Projection) -> Tensor:
     """Points ``(P, 4)`` at the centres of the pixels with a return; intensity 0 if not known."""
     intensity = pixels.intensity
     if intensity is None:
         intensity = torch.zeros_like(pixels.range_m)
-    return points_of(pixels.range_m, SphericalProjection(sensor), intensity=intensity)
+    return points_of(pixels.range_m, projection, intensity=intensity)
 
 
 def _lost_in_weather(path: Path, sensor: LidarSensor) -> ScanError:

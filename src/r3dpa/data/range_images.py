@@ -27,7 +27,6 @@ from r3dpa.data.pixel_codes import decode_pixels, encode_pixels
 from r3dpa.data.store import CachedTensors, ItemKey, Store, tensor_cache
 from r3dpa.geometry import (
     SEMANTIC_CLASSES,
-    LidarSensor,
     Pixels,
     Projection,
     points_of,
@@ -68,13 +67,13 @@ class CachedPixels:
     """Images of a cache: of ranges alone in float16, else in the codes of ``pixel_codes``."""
 
     rows: CachedTensors[SimulatedImage]
-    range_max_m: float
+    projection: Projection
 
     def read(self, image: SimulatedImage, /) -> Pixels:
         """Pixels ``(H, W)`` of an image."""
         row = self.rows.read(image)
         coded = self.rows.store.dtype == "uint8"
-        return decode_pixels(row, self.range_max_m) if coded else Pixels(row)
+        return decode_pixels(row, self.projection.sensor.range_max_m) if coded else Pixels(row)
 
 
 class SimulatedImageDataModule(LidarDataModule):
@@ -160,7 +159,7 @@ class SimulatedImageDataModule(LidarDataModule):
         """Cached images of all scans."""
         train, val = self.limited_split()
         images: list[Any] = sorted(train + val)
-        return CachedPixels(CachedTensors(self._store, images), self.sensor.range_max_m)
+        return CachedPixels(CachedTensors(self._store, images), self._known_projection)
 
     def points(self, scan: Any) -> Tensor:
         """Points ``(P, 3)`` at the centres of the pixels."""
@@ -225,10 +224,10 @@ class SimulatedImageDataModule(LidarDataModule):
             return
         rank_zero_info(f"making {len(missing)} feature grids in {grids.folder}")
         extractor = cast(Extractor, self.extractor)
-        images = CachedPixels(CachedTensors(self._store, missing), self.sensor.range_max_m)
-        dataset = _CachedPoints(missing, images, self.sensor, extractor.prepare)
-        loader = plain_loader(dataset, 1, self.num_workers, collate_fn=list)
         projection = self._known_projection
+        images = CachedPixels(CachedTensors(self._store, missing), projection)
+        dataset = _CachedPoints(missing, images, extractor.prepare)
+        loader = plain_loader(dataset, 1, self.num_workers, collate_fn=list)
         with grids.writer() as writer:
             for samples in tqdm(loader, desc="feature grids", unit="scan", disable=None):
                 pooled = pooled_grids(extractor, samples, projection, [self.grid_size])
@@ -241,7 +240,6 @@ class _CachedPoints(Dataset[PointSample]):
 
     items: Sequence[SimulatedImage]
     images: CachedPixels
-    sensor: LidarSensor
     prepare: Callable[..., Any]
 
     def __len__(self) -> int:
@@ -249,7 +247,7 @@ class _CachedPoints(Dataset[PointSample]):
 
     def __getitem__(self, index: int) -> PointSample:
         item = self.items[index]
-        points = points_at_pixels(self.images.read(item), self.sensor)
+        points = points_at_pixels(self.images.read(item), self.images.projection)
         return PointSample(cast(Any, item), item.cache_key, points, self.prepare(points))
 
 

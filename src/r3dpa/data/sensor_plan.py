@@ -15,7 +15,6 @@ import torch
 import yaml
 
 from lidarsim import Simulator
-from lidarsim.scan_files import read_scan
 from lidarsim.sensors import SpinningLidar, load_sensor
 from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.data.scans import Scan, evenly
@@ -46,7 +45,7 @@ class Split(NamedTuple):
 
 @dataclass(frozen=True)
 class SensorPlan:
-    """What a run of ``make my-sensor`` does.
+    """Plan of one run of ``make my-sensor``.
 
     Args:
         sensor: Preset or YAML file of the sensor.
@@ -137,7 +136,7 @@ class SensorPlan:
         }
 
     def write(self, out: Path) -> None:
-        """Write :meth:`files`, and what more time would add."""
+        """Write :meth:`files` and :attr:`more`."""
         for name, content in self.files(out).items():
             text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
             write_text(out / f"{name}.yaml", text)
@@ -185,7 +184,7 @@ class SensorPlan:
 
     @property
     def more(self) -> str:
-        """What an hour or a GPU would add."""
+        """Text that says what an hour or a GPU improves."""
         return (
             f"Planned for {self.minutes:g} minutes on two idle cores: {self.num_simulated} scans, "
             f"{self._steps_text}; a slower machine stops a stage before its last step.\n"
@@ -229,6 +228,6 @@ def _seconds_per_scan(lidar: SpinningLidar) -> float:
 def _mean_share_kept(scans: list[Scan], projection: BeamProjection) -> float:
     shares = []
     for scan in scans:
-        points = torch.from_numpy(read_scan(scan.path, projection.sensor)[:, :3])
+        points = torch.from_numpy(scan.read(projection.sensor)[:, :3])
         shares.append(share_kept(points, projection))
     return sum(shares) / len(shares)

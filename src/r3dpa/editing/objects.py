@@ -24,7 +24,6 @@ from r3dpa.data.scans import Scan
 from r3dpa.geometry import (
     LidarSensor,
     Projection,
-    SphericalProjection,
     in_range,
     labels_of,
     projection_to_dict,
@@ -238,8 +237,8 @@ def _labelled_points(
     pixels = images.read(scan)
     if pixels.classes is None:
         raise ValueError("the cached images have no classes: set codec.num_classes of the data")
-    classes = values_at_returns(pixels.classes, pixels.range_m, SphericalProjection(sensor))
-    return points_at_pixels(pixels, sensor), labels_of(classes)
+    classes = values_at_returns(pixels.classes, pixels.range_m, images.projection)
+    return points_at_pixels(pixels, images.projection), labels_of(classes)
 
 
 def _cells_of_classes(
