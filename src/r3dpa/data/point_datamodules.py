@@ -84,22 +84,13 @@ class LabelledPointDataModule(PointDataModule):
 
     Args:
         source: Scans and their split, with or without label files, see
-            :func:`r3dpa.data.labels.read_labels`, or with classes in its cached images. Give it
+            :func:`r3dpa.data.labels.find_labels`, or with classes in its cached images. Give it
             ``extractor: null``.
         prepare: An ``r3dpa.features.Masking``.
-        batch_size: Scans per batch and process.
-        num_workers: Loader processes per training process.
-        seed: Seed of order and draws.
+        kwargs: Further arguments of :class:`PointDataModule`.
     """
 
     points_class = LabelledPoints
 
-    def __init__(
-        self,
-        source: LidarDataModule,
-        prepare: Callable[..., Any],
-        batch_size: int = 2,
-        num_workers: int = 0,
-        seed: int = 0,
-    ) -> None:
-        super().__init__(source, prepare, batch_size, num_workers, seed)
+    def __init__(self, source: LidarDataModule, prepare: Callable[..., Any], **kwargs: Any) -> None:
+        super().__init__(source, prepare, weather=None, **kwargs)  # so that it is no option

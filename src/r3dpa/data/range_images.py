@@ -18,8 +18,7 @@ from torch.utils.data import Dataset
 from tqdm import tqdm
 
 from lidarsim import SIMULATOR_VERSION, TRAIN_DRIVES, VAL_DRIVES, Simulator, split_scans
-from lidarsim.scene import Conditions
-from r3dpa.data.datamodules import LidarDataModule
+from r3dpa.data.datamodules import SimulatedDataModule
 from r3dpa.data.datasets import PointSample, points_at_pixels
 from r3dpa.data.feature_grids import Extractor, GridSettings, pooled_grids
 from r3dpa.data.loaders import at_least, plain_loader
@@ -76,7 +75,7 @@ class CachedPixels:
         return decode_pixels(row, self.projection.sensor.range_max_m) if coded else Pixels(row)
 
 
-class SimulatedImageDataModule(LidarDataModule):
+class SimulatedImageDataModule(SimulatedDataModule):
     """Simulated streets whose range images are cached in float16, 131 kB each; points are dropped.
 
     Images are made before the first use, and so are feature grids if there is an extractor: only
@@ -88,36 +87,16 @@ class SimulatedImageDataModule(LidarDataModule):
     Args:
         root: Folder of the caches.
         every: Stride in scans of a drive; neighbours are 0.1 s apart.
-        num_scans: Scans to simulate, over all drives; 2 or more, a fifth of them held out.
-        simulation_seed: Seed of streets and instrument.
-        simulation_sensor: Instrument: preset of ``r3dpa data sensors`` or a YAML file;
-            ``sensor`` is about the range images.
-        effects: ``auto``, ``on`` or ``off`` by effect; those not named are ``auto``.
-        weather: Weather of all scans; drawn where None.
-        kwargs: Arguments of :class:`LidarDataModule`, without ``projection: rings``.
+        columns: Not read, but named by the configurations of earlier runs.
+        kwargs: Arguments of :class:`SimulatedDataModule`, without ``projection: rings``.
     """
 
-    makes_scans = True
-
-    def __init__(
-        self,
-        root: str,
-        every: int = 1,
-        num_scans: int = 1000,
-        simulation_seed: int = 0,
-        simulation_sensor: str = "hdl64e",
-        effects: dict[str, str | bool] | None = None,
-        weather: Conditions | None = None,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(scans=root, val_every=None, val_drives=None, **kwargs)
+    def __init__(self, root: str, every: int = 1, columns: None = None, **kwargs: Any) -> None:
+        super().__init__(root, **kwargs)
         at_least(1, every=every)
-        at_least(2, num_scans=num_scans)  # one of them is held out
         if self.projection_kind == "rings":
             raise ValueError("projection must not be rings: the points are not kept to fit them")
-        self.root, self.every, self.num_scans = root, every, num_scans
-        self.simulation_seed, self.simulation_sensor = simulation_seed, simulation_sensor
-        self.effects, self.weather = effects, weather
+        self.every = every
 
     def split(self) -> tuple[list[Any], list[Any]]:
         """Images of the official training and validation drives."""

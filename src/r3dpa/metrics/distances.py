@@ -357,11 +357,7 @@ class MinimumMatchingDistance(_ImageMetric):
             statistics file; the 3D distance is then left out.
     """
 
-    def __init__(
-        self, protocol: Protocol, max_real: int | None = None, max_generated: int | None = None
-    ) -> None:
-        super().__init__(protocol, max_real, max_generated)
-        self.reference_cells: list[Tensor] = []
+    reference_cells: Sequence[Tensor] = ()
 
     def matching(self) -> Matching:
         """Find the nearest generated scene of each real one."""

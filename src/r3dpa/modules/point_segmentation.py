@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -27,10 +28,7 @@ class PointSegmentation(PointPretraining):
         network: Network to train, with the ``cells`` of the scans' grid.
         start: Weights file of ``WaffleIronS`` to start from, of the same sizes as ``network``.
         geometry_weight: Weight of the loss of the masked geometry.
-        lr: Peak learning rate; rises over ``warmup`` steps and falls to 0 as a cosine until
-            ``max_steps`` of the trainer.
-        weight_decay: Of AdamW, on matrices only.
-        warmup: Steps.
+        kwargs: Further arguments of :class:`PointPretraining`.
     """
 
     source = WaffleIronS2
@@ -41,11 +39,9 @@ class PointSegmentation(PointPretraining):
         network: WaffleIron,
         start: Path | None = None,
         geometry_weight: float = 1.0,
-        lr: float = 2e-3,
-        weight_decay: float = 0.03,
-        warmup: int = 100,
+        **kwargs: Any,
     ) -> None:
-        super().__init__(network, lr, weight_decay, warmup)
+        super().__init__(network, **kwargs)
         self.geometry_weight = geometry_weight
         self.class_head = nn.Linear(network.width, NUM_CLASSES)
         if start is not None:
