@@ -4,9 +4,9 @@
         --real FOLDER --num 2000 --out quality.json
 
 Of held-out scans of a data YAML and, with ``--real``, of the scans of a folder, with the classes of
-label files beside them. Figures are from ``r3dpa.metrics.reconstruction``, each over all pixels;
-``intensity_spread`` is the mean absolute difference of intensities from their median, the error of
-a constant. About 0.2 s of a core per scan.
+label files beside them. Figures are from ``ReconstructionQuality`` and ``LabelQuality``, each over
+all pixels; ``intensity_spread`` is the mean absolute difference of intensities from their median,
+the error of a constant. About 0.2 s of a core per scan.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from itertools import islice
 from pathlib import Path
 
 import torch
+from label_quality import LabelQuality
 
 from lidarsim.scan_files import read_scan
 from r3dpa.cli.features import read_data
@@ -25,7 +26,7 @@ from r3dpa.data.labels import find_labels
 from r3dpa.data.scans import evenly, find_scans
 from r3dpa.geometry import Pixels, project_pixels
 from r3dpa.io import text_table
-from r3dpa.metrics.reconstruction import LabelQuality, ReconstructionQuality
+from r3dpa.metrics.reconstruction import ReconstructionQuality
 from r3dpa.scene_vae import SceneVAE
 
 BATCH_SIZE = 8
