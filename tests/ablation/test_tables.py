@@ -10,9 +10,8 @@ from tiny_evaluations import evaluation
 
 from r3dpa.ablation import write_table
 from r3dpa.ablation.plan import Plan, PlannedStage, Row, Table
-from r3dpa.ablation.tables import order_results
+from r3dpa.ablation.tables import mean_of_seeds, order_results
 from r3dpa.metrics.results import Evaluation, MetricResult
-from r3dpa.metrics.seeds import mean_of_seeds
 
 RECORDED = Path(__file__).resolve().parents[2] / "notebooks" / "results" / "ablation_demo"
 

@@ -14,7 +14,7 @@ from tiny_stages import (
 )
 
 from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint
-from r3dpa.cli.replay import replay
+from r3dpa.cli.runs import replay
 from r3dpa.nn import AverageVelocitySiT
 
 pytestmark = QUIET

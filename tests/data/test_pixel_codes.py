@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import torch
 
-from r3dpa.data.pixel_codes import decode_pixels, encode_pixels
+from r3dpa.data.range_images import decode_pixels, encode_pixels
 from r3dpa.geometry import NUM_CLASSES, Pixels
 
 

@@ -22,9 +22,14 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from r3dpa import __version__
-from r3dpa.checkpoints.networks import FACTS, Checkpoint, NetworkState, path_of
+from r3dpa.checkpoints.networks import (
+    FACTS,
+    Checkpoint,
+    NetworkState,
+    path_of,
+    recorded_sampling,
+)
 from r3dpa.checkpoints.official import OURS, from_official, is_official, statistics_of, to_official
-from r3dpa.checkpoints.older import recorded_sampling
 from r3dpa.class_paths import current_network
 from r3dpa.io import (
     UNPICKLING_ERRORS,

@@ -284,3 +284,16 @@ def _different_settings(state: NetworkState, network: nn.Module) -> list[str]:
 def _shorten(lines: list[str]) -> list[str]:
     rest = len(lines) - _NUM_LISTED
     return lines if rest <= 0 else [*lines[:_NUM_LISTED], f"... and {rest} more"]
+
+
+def recorded_sampling(facts: Mapping[str, Any], configs: Mapping[str, Any]) -> dict[str, Any]:
+    """Sampling settings of a checkpoint: a fact, or in older files an argument of its SiT."""
+    if facts.get("sampling") is not None:
+        return dict(facts["sampling"])
+    for name in ("ema", "sit"):
+        config = configs.get(name)
+        init_args = config.get("init_args") if isinstance(config, Mapping) else None
+        if init_args and init_args.get("guidance_block"):
+            scale = init_args.get("guidance_scale", 1.0)
+            return {"perturbed_attention": {"block": init_args["guidance_block"], "scale": scale}}
+    return {}

@@ -17,8 +17,13 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from r3dpa.checkpoints.networks import FACTS, Checkpoint, NetworkState, path_of
-from r3dpa.checkpoints.older import recorded_sampling
+from r3dpa.checkpoints.networks import (
+    FACTS,
+    Checkpoint,
+    NetworkState,
+    path_of,
+    recorded_sampling,
+)
 from r3dpa.class_paths import current_network
 from r3dpa.nn.discriminator import PatchDiscriminator
 from r3dpa.nn.latent_norm import LatentNorm

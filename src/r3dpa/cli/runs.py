@@ -1,7 +1,8 @@
-"""``r3dpa convert`` and ``report``: checkpoints and losses of a run."""
+"""``r3dpa convert``, ``report`` and ``replay``: checkpoints, losses and skipped steps of a run."""
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -71,3 +72,54 @@ def report(run: Path) -> str:
         rows.append([name, f"{first:.5g}", f"{last:.5g}", f"{last - first:+.5g}"])
     table = text_table(rows, ["quantity", "first tenth", "last tenth", "change"], "lrrr", "plain")
     return f"{table}\ncurves: {run / 'loss_curves.png'}" if drawn else table
+
+
+def replay(file: Path, ckpt: Path, device: str = "cpu") -> str:
+    """Repeat a skipped step to find the layer that failed.
+
+    The losses are computed in float32, with the draws and loss weights of the step.
+
+    Args:
+        file: Batch of ``<run_dir>/bad_batches``.
+        ckpt: Weights, ideally of the last step before it.
+        device: ``cpu``, ``cuda`` or ``cuda:1``.
+    """
+    from r3dpa.callbacks.bad_batches import format_values, read_bad_batch
+    from r3dpa.checkpoints import read_checkpoint
+    from r3dpa.modules import FewStep, FlowMatching, JointAlignment, LossWeights, VAEAlignment
+
+    saved, weights = read_bad_batch(file), read_checkpoint(ckpt)
+    stages = {s.stage: s for s in (VAEAlignment, JointAlignment, FlowMatching, FewStep)}
+    known = {"vae", "sit", "latent_norm", "discriminator", "thin_decoder"} & set(weights.networks)
+    networks: Any = {name: weights.network(name).build() for name in known}
+    settings = LossWeights(**saved["weights"])
+    module = stages[saved["stage"]](**networks, weights=settings, path=saved["path"]).to(device)
+    draws = saved["draws"]._make(value.to(device) for value in saved["draws"])
+    batch: Any = {name: value.to(device) for name, value in saved["batch"].items()}
+    # Without a trainer there is no number of the batch, and nothing to log to.
+    module.draw_path = lambda *_: draws  # type: ignore[method-assign]
+    module.log_dict = lambda *_: None  # type: ignore[method-assign]
+
+    lines = [f"{file}: stage {saved['stage']}, step {saved['step']}, {saved['precision']}"]
+    for name, value in (batch | draws._asdict() | module.state_dict()).items():
+        if num_bad := int((~value.isfinite()).sum()):
+            lines.append(f"{name}: {num_bad} of {value.numel()} values are not finite")
+    broken: dict[str, bool] = {}  # layers with a bad output, and whether their inputs were finite
+
+    def observe(name: str, layer: Any, inputs: Any, output: Any) -> None:
+        if not output.isfinite().all():
+            broken.setdefault(name, all(bool(value.isfinite().all()) for value in inputs))
+
+    for name, layer in module.named_modules():
+        if not list(layer.children()):
+            layer.register_forward_hook(partial(observe, name))
+    try:
+        module.training_step(batch, 0)
+    except RuntimeError as error:  # the shapes of the batch do not fit the networks
+        raise ValueError(f"{file} cannot be run with the networks of {ckpt}: {error}") from error
+    lines.append(f"losses then: {format_values(saved['losses'])}")
+    losses = {name: float(loss) for name, loss in module.logged_losses.items()}
+    lines.append(f"losses now:  {format_values(losses)}")
+    causes = ", ".join(name for name, inputs_finite in broken.items() if inputs_finite) or "none"
+    lines.append(f"layers whose output is not finite: {len(broken)}, from finite inputs: {causes}")
+    return "\n".join(lines)
