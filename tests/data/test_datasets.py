@@ -79,7 +79,9 @@ def test_weather_that_leaves_no_point_is_blamed_and_not_the_file(tmp_path, proje
         n for n in range(40) if fog.draw(np.random.default_rng((0, n, 0))).visibility_m < 2
     )
     scans = write(tmp_path, wall)
-    points = DrawnPoints(scans, projection.sensor, lambda points, generator: points, 0, fog)
+    points = DrawnPoints(
+        scans, projection.sensor, lambda points, generator: points, seed=0, weather=fog
+    )
     images = LidarDataset(scans, projection, RangeCodec())
     in_fog = partial(fog.points, seed=(0, epoch, 0))
     for sample in (lambda: points[epoch, 0], lambda: images.sample(0, in_fog)):

@@ -144,13 +144,16 @@ class PointSample(NamedTuple):
 class PointDataset(Dataset[Any]):
     """Points of each scan, prepared for a network by the loader processes.
 
+    Where ``images`` are given, the points lie at the centres of their pixels.
+
     Raises:
         ScanError: For a scan without a point within the range limits of ``sensor``.
     """
 
-    scans: Sequence[Scan]
+    scans: Sequence[Any]
     sensor: LidarSensor
     prepare: Callable[..., Any]
+    images: CachedImages | None = None
 
     def __len__(self) -> int:
         return len(self.scans)
@@ -158,8 +161,14 @@ class PointDataset(Dataset[Any]):
     def __getitem__(self, index: int) -> PointSample:
         scan = self.scans[index]
         key = scan.cache_key
-        points = torch.from_numpy(scan.read(self.sensor))
+        points = self.points(scan)
         return PointSample(scan, key, points, self.prepare(points))
+
+    def points(self, scan: Any) -> Tensor:
+        """Points ``(P, 4)`` of a scan or of its cached image."""
+        if self.images is None:
+            return torch.from_numpy(scan.read(self.sensor))
+        return points_at_pixels(self.images.read(scan), self.images.projection)
 
 
 @dataclass(eq=False, repr=False)
@@ -167,27 +176,20 @@ class DrawnPoints(PointDataset):
     """Random preparation of points, ``prepare(points, generator)``.
 
     An item ``(epoch, index)``, or ``index`` of epoch 0, is a function of these and ``seed`` alone.
-    ``weather`` changes the points of an item of an epoch. Where ``images`` are given, the points
-    lie at the centres of their pixels.
+    ``weather`` changes the points of an item of an epoch.
     """
 
-    seed: int
+    seed: int = 0
     weather: WeatherPrior | None = None
-    images: CachedImages | None = None
 
     def __getitem__(self, key: tuple[int, int] | int) -> Any:
         epoch, index = key if isinstance(key, tuple) else (0, key)
-        if self.images is None:
-            read = self.scans[index].read(self.sensor)
-        else:
-            read = points_at_pixels(
-                self.images.read(self.scans[index]), self.images.projection
-            ).numpy()
+        points = self.points(self.scans[index])
         if self.weather is not None and isinstance(key, tuple):
-            read = self.weather.points(read, (self.seed, epoch, index))
-            if not in_range(torch.from_numpy(read[:, :3]), self.sensor).any():
+            changed = self.weather.points(points.numpy(), (self.seed, epoch, index))
+            points = torch.from_numpy(changed)
+            if not in_range(points[:, :3], self.sensor).any():
                 raise _lost_in_weather(self.scans[index].path, self.sensor)
-        points = torch.from_numpy(read)
         return self.prepare(points, np.random.default_rng((self.seed, epoch, index)))
 
 

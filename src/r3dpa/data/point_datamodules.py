@@ -63,7 +63,7 @@ class PointDataModule(LoaderModule):
             )
         self.train_set, self.val_set = (
             self.points_class(
-                scans, self.source.sensor, self.prepare, self.seed, self.weather_prior, images
+                scans, self.source.sensor, self.prepare, images, self.seed, self.weather_prior
             )
             for scans in self.source.limited_split()
         )

@@ -20,8 +20,8 @@ from tqdm import tqdm
 
 from lidarsim import SIMULATOR_VERSION, TRAIN_DRIVES, VAL_DRIVES, Simulator, split_scans
 from r3dpa.data.datamodules import SimulatedDataModule
-from r3dpa.data.datasets import PointSample, points_at_pixels
-from r3dpa.data.feature_grids import Extractor, GridSettings, pooled_grids
+from r3dpa.data.datasets import PointDataset, PointSample
+from r3dpa.data.feature_grids import Extractor, GridSettings, extract_grids, pooled_grids
 from r3dpa.data.loaders import at_least, plain_loader
 from r3dpa.data.store import CachedTensors, ItemKey, Store, tensor_cache
 from r3dpa.geometry import (
@@ -212,29 +212,9 @@ class SimulatedImageDataModule(SimulatedDataModule):
         extractor = cast(Extractor, self.extractor)
         projection = self._known_projection
         images = CachedPixels(CachedTensors(self._store, missing), projection)
-        dataset = _CachedPoints(missing, images, extractor.prepare)
-        loader = plain_loader(dataset, 1, self.num_workers, collate_fn=list)
-        with grids.writer() as writer:
-            for samples in tqdm(loader, desc="feature grids", unit="scan", disable=None):
-                pooled = pooled_grids(extractor, samples, projection, [self.grid_size])
-                writer.add([sample.key for sample in samples], pooled[self.grid_size])
-
-
-@dataclass(eq=False, repr=False)
-class _CachedPoints(Dataset[PointSample]):
-    """Points of the pixels of cached images, prepared for an extractor."""
-
-    items: Sequence[SimulatedImage]
-    images: CachedPixels
-    prepare: Callable[..., Any]
-
-    def __len__(self) -> int:
-        return len(self.items)
-
-    def __getitem__(self, index: int) -> PointSample:
-        item = self.items[index]
-        points = points_at_pixels(self.images.read(item), self.images.projection)
-        return PointSample(cast(Any, item), item.cache_key, points, self.prepare(points))
+        dataset = PointDataset(missing, self.sensor, extractor.prepare, images)
+        stores = {self.grid_size: grids}
+        extract_grids(dataset, extractor, projection, stores, workers=self.num_workers)
 
 
 @dataclass(eq=False, repr=False)
