@@ -251,7 +251,7 @@ REFUSED = [
     ("complete", "--keep_every 1", "2 to 8, got 1"),
     ("vary", "--device tpu", "device 'tpu' cannot be used here"),
     ("vary", "--scan tilted.bin", r"tilted.bin: .*outside the field"),
-    ("vary", "--scan two.npz", r"holds 2 scans \(x, y\)"),
+    ("vary", "--scan two.npz", "must hold one scan.*its arrays are x, y"),
     ("vary", "--scan gone.bin", "gone.bin"),
     ("interpolate", "--left a.bin --right b.bin --frames 1", "at least 2"),
 ]

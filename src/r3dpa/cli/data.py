@@ -178,12 +178,19 @@ def sensors() -> str:
 
     rows = []
     for name in PRESETS:
-        title, source, sensor = read_sensor(name)
-        degrees = np.degrees(sensor.lasers.inclination_rad)
-        view = f"{degrees[0]:+.2f} to {degrees[-1]:+.2f}"
-        limits = f"{sensor.min_range_m:g} to {sensor.max_range_m:g}"
-        numbers = [f"{sensor.num_beams}", f"{sensor.shots}", view, limits]
-        rows.append([name, title, *numbers, source.strip()])
+        title, source, lidar = read_sensor(name)
+        lowest_deg, *_, highest_deg = np.degrees(lidar.lasers.inclination_rad)
+        rows.append(
+            [
+                name,
+                title,
+                f"{lidar.num_beams}",
+                f"{lidar.shots}",
+                f"{lowest_deg:+.2f} to {highest_deg:+.2f}",
+                f"{lidar.min_range_m:g} to {lidar.max_range_m:g}",
+                source.strip(),
+            ]
+        )
     header = ["name", "sensor", "beams", "columns", "field of view, deg", "range, m", "source"]
     return text_table(rows, header, "llrrrrl", "plain")
 
@@ -240,8 +247,9 @@ def plan(
     check_folder(out)
     from r3dpa.data.sensor_plan import SensorPlan
 
-    # Plain numbers, which YAML can hold.
-    numbers = (float(minutes), int(columns), int(workers))
-    sensor_plan = SensorPlan.of(sensor, str(scans), *numbers)
+    # YAML cannot hold the number types of options.
+    sensor_plan = SensorPlan.of(
+        sensor, str(scans), minutes=float(minutes), columns=int(columns), workers=int(workers)
+    )
     sensor_plan.write(out)
     return str(sensor_plan)

@@ -203,12 +203,11 @@ def complete(
             "nothing is missing: give --sector, --keep_every, --empty_beams, --other_sensor or "
             "--mask"
         )
-    from r3dpa.cli.edit_complete import MissingPixels, complete_files
+    from r3dpa.cli.edit_complete import CompletionJob, MissingPixels, complete_files
 
     missing = MissingPixels(sector, keep_every, empty_beams, other_sensor, mask)
-    return complete_files(
-        scan, EditOptions(**options), missing, arguments, num, start, resamplings, workers
-    )
+    job = CompletionJob(EditOptions(**options), missing, num, start, resamplings)
+    return complete_files(scan, job, arguments, workers)
 
 
 def vary(*, scan: Path, start: float = 0.5, num: PositiveInt = 8, **options: Any) -> str:

@@ -23,7 +23,7 @@ from r3dpa.data.scene_writer import SceneWriter
 from r3dpa.editing import EditResult
 from r3dpa.editing.gaps import interpolate_gaps, range_error_m, unseen_pixels
 from r3dpa.editing.regions import check_mask, dropped_beams, sector, sensor_pair
-from r3dpa.geometry import Projection, SphericalProjection, points_of, values_at_returns
+from r3dpa.geometry import Pixels, Projection, SphericalProjection, points_of, values_at_returns
 from r3dpa.io import in_processes
 
 _SCANS = "scans"  # folder of the completed scans
@@ -85,28 +85,28 @@ class CompletionJob:
     """A call completes one file, writes the results and returns their images.
 
     Args:
-        root: Folder that names of results are relative to.
         options: Options of the edit.
         missing: What is missing.
         num: Results per scan.
         start: Time of the noise; default: the editor's.
         resamplings: Of RePaint.
+        root: Folder that names of results are relative to.
         threads: Of torch in each process; None leaves them as they are.
     """
 
-    root: Path
     options: EditOptions
     missing: MissingPixels
     num: int
     start: float | None
     resamplings: int | None
-    threads: int | None
+    root: Path = Path()
+    threads: int | None = None
 
     def read(self, path: Path) -> tuple[PointCloud, ScanView, Tensor]:
         """A scan, its view, and the mask of what is missing."""
         session, cloud = _session(self.options, self.num), read_cloud(path, self.options.columns)
-        view = session.view(path, cloud, only_in_view=True)
-        missing = self.missing.find(view.range_m, session)
+        view = session.view(path, cloud)
+        missing = self.missing.find(view.pixels.range_m, session)
         session.check(view, missing)
         return cloud, view, missing
 
@@ -138,25 +138,19 @@ def _session(options: EditOptions, num: int) -> EditSession:
 
 
 def complete_files(
-    source: Path,
-    options: EditOptions,
-    missing: MissingPixels,
-    arguments: dict[str, Any],
-    num: int,
-    start: float | None,
-    resamplings: int | None,
-    workers: int,
+    source: Path, job: CompletionJob, arguments: dict[str, Any], workers: int
 ) -> str:
     """Complete a scan or all scans of a folder; return a summary with errors."""
     root, paths = find_files(source)
+    options, num = job.options, job.num
     session = _session(options, num)
     stage = session.checkpoint.stage
-    if start is not None and session.baseline is not None:
+    if job.start is not None and session.baseline is not None:
         raise ValueError(f"--start is for R3DPA: stage {stage} starts from noise")
-    if resamplings is not None and stage not in ("r2dm", "r2flow"):
+    if job.resamplings is not None and stage not in ("r2dm", "r2flow"):
         raise ValueError(f"--resamplings is for R2DM and R2Flow, not for stage {stage}")
     threads = None if workers == 1 else max(1, (os.cpu_count() or 1) // workers)
-    job = CompletionJob(root, options, missing, num, start, resamplings, threads)
+    job = replace(job, root=root, threads=threads)
     _, first_view, first_missing = job.read(paths[0])  # a bad request fails before the first file
     names = [path.relative_to(root).as_posix() for path in paths]
     request = session.request("complete", arguments, {"scans": names})
@@ -173,12 +167,15 @@ def complete_files(
                 None if intensity is None else torch.from_numpy(intensity),
             )
         writer.close()
-        images = np.load(writer.range_path, mmap_mode="r").reshape(len(paths), num, *_size(session))
+        images = np.load(writer.range_path, mmap_mode="r")
+        images = images.reshape(len(paths), num, *images.shape[1:])
         errors = {}
         for name, path, image in zip(names, paths, images, strict=True):
             _, view, gaps = job.read(path)
-            errors[name] = held_out_errors(torch.from_numpy(image.copy()), view.range_m, gaps)
-        known = first_view._replace(range_m=torch.where(first_missing, -1.0, first_view.range_m))
+            completed = torch.from_numpy(image.copy())
+            errors[name] = held_out_errors(completed, view.pixels.range_m, gaps)
+        known_m = torch.where(first_missing, -1.0, first_view.pixels.range_m)
+        known = first_view._replace(pixels=Pixels(known_m))
         shown = {f"scan {paths[0].stem}": first_view, "known part": known}
         first_images = torch.from_numpy(images[0].copy())
         session.show("complete", shown, first_images, first_missing, ("kept", "missing"))
@@ -290,7 +287,3 @@ def _summary(num_scans: int, nfe: int, errors: dict[str, Any], out: Path) -> str
         f"input, then the generated ones\n{text}\n"
         f"open {out / 'edit.png'} and {out / 'edit.html'}"
     )
-
-
-def _size(session: EditSession) -> tuple[int, int]:
-    return session.sensor.beams, session.sensor.columns

@@ -16,7 +16,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from lidarsim.clouds import PointCloud
-from lidarsim.scan_files import out_of_range, read_clouds
+from lidarsim.scan_files import out_of_range, read_scan
 from r3dpa import viz
 from r3dpa.checkpoints import read_checkpoint
 from r3dpa.cli.parser import EditOptions
@@ -41,18 +41,11 @@ _SHOWN = 8  # results on the sheet and the page
 
 
 class ScanView(NamedTuple):
-    """A scan: its file, points ``(P, 4)``, range image, intensity and classes ``(H, W)``."""
+    """A scan: its file, points ``(P, 4)``, and pixels ``(H, W)``, the input of the model."""
 
     path: Path
     points: Tensor
-    range_m: Tensor
-    intensity: Tensor
-    classes: Tensor | None = None
-
-    @property
-    def pixels(self) -> Pixels:
-        """Input of the model."""
-        return Pixels(self.range_m, self.intensity, self.classes)
+    pixels: Pixels
 
 
 class EditSession:
@@ -106,57 +99,38 @@ class EditSession:
 
     def read(self, path: Path) -> ScanView:
         """Read a scan, which must fill the field of view."""
-        clouds = read_clouds(path, self.options.columns)
-        if len(clouds) > 1:
-            names = ", ".join(list(clouds)[:3])
-            raise ScanError(f"{path}: holds {len(clouds)} scans ({names}); give a file of one")
-        (cloud,) = clouds.values()
-        points = torch.zeros(len(cloud), 4)  # intensity 0 if the file has none
-        points[:, : cloud.shape[1]] = torch.from_numpy(cloud.copy())
-        if not points.isfinite().all():
-            raise ScanError(f"{path}: has NaN or infinite values")
-        scan = self._project(path, points)
+        points = torch.from_numpy(read_scan(path, self.sensor, self.options.columns))
+        scan = ScanView(path, points, project_pixels(points, self.projection))
         self.check(scan)
         return scan
 
-    def view(self, path: Path, cloud: PointCloud, only_in_view: bool = False) -> ScanView:
+    def view(self, path: Path, cloud: PointCloud) -> ScanView:
         """View of a scan that was read; unchecked.
 
-        ``only_in_view`` leaves out points above and below the field of view, which otherwise land
-        in the first and last row.
+        Points above and below the field of view, which would land in the first and last row, are in
+        no pixel.
         """
-        labels = None
-        if cloud.labels is not None:
-            labels = torch.from_numpy(cloud.labels.astype(np.int64))
-        return self._project(path, torch.from_numpy(cloud.rows()), labels, only_in_view)
-
-    def _project(
-        self,
-        path: Path,
-        points: Tensor,
-        labels: Tensor | None = None,
-        only_in_view: bool = False,
-    ) -> ScanView:
+        points, labels = torch.from_numpy(cloud.rows()), None
         if not in_range(points[:, :3], self.sensor).any():
             raise out_of_range(path, self.sensor)
-        seen = points
-        if only_in_view:
-            outside = ~in_view(points[:, :3], self.projection)
-            seen = points.masked_fill(outside[:, None], torch.nan)  # in no pixel
-        pixels = project_pixels(seen, self.projection, labels)
-        assert pixels.intensity is not None
-        return ScanView(path, points, pixels.range_m, pixels.intensity, pixels.classes)
+        if cloud.labels is not None:
+            labels = torch.from_numpy(cloud.labels.astype(np.int64))
+        outside = ~in_view(points[:, :3], self.projection)
+        seen = points.masked_fill(outside[:, None], torch.nan)
+        return ScanView(path, points, project_pixels(seen, self.projection, labels))
 
     def check(self, scan: ScanView, missing: Tensor | None = None) -> None:
         """Refuse a scan that does not fill the field of view outside ``missing`` ``(H, W)``."""
         try:
-            check_view(scan.points[:, :3], scan.range_m, self.projection, missing)
+            check_view(scan.points[:, :3], scan.pixels.range_m, self.projection, missing)
         except ValueError as error:
             raise ScanError(f"{scan.path}: {error}") from error
 
     def complete(self, scan: ScanView, missing: Tensor, resamplings: int) -> EditResult:
         """Completions of a scan by a baseline; pixels that are not missing stay."""
-        image, size = self.geometry.codec.to_image(scan.range_m, scan.intensity), self.num
+        range_m, scan_intensity, _ = scan.pixels
+        assert scan_intensity is not None
+        image, size = self.geometry.codec.to_image(range_m, scan_intensity), self.num
         batches: list[SceneBatch] = [
             self.baseline.complete(
                 image,
@@ -173,8 +147,8 @@ class EditSession:
 
         intensity = None
         if self.geometry.codec.reflectance:
-            intensity = torch.where(missing, joined("intensity"), scan.intensity)
-        ranges = torch.where(missing, joined("range_m"), scan.range_m)
+            intensity = torch.where(missing, joined("intensity"), scan_intensity)
+        ranges = torch.where(missing, joined("range_m"), range_m)
         return EditResult(ranges, joined("latents"), batches[0].nfe, self.projection, intensity)
 
     def read_mask(self, path: Path) -> Tensor:
@@ -186,7 +160,7 @@ class EditSession:
         source = feature_source_of(self.checkpoint)
         extractor: Any = feature_source(source, ckpt, self.sit.feature_dim).to(self.device)
         grids = []
-        for path, points, *_ in scans:
+        for path, points, _ in scans:
             file = Scan(path.parent.name, path.stem, path)
             sample = PointSample(file, file.cache_key, points, extractor.prepare(points))
             by_size = pooled_grids(extractor, [sample], self.projection, [self.sit.grid_size])
@@ -276,7 +250,7 @@ class EditSession:
     ) -> None:
         """Write ``before.npy``, pictures and the page of scans and results ``(B, H, W)``."""
         out = self.options.out
-        before = {name: scan.range_m for name, scan in scans.items()}
+        before = {name: scan.pixels.range_m for name, scan in scans.items()}
         images = torch.stack(list(before.values()))
         with atomic_path(out / "before.npy") as temporary, temporary.open("wb") as file:
             np.save(file, images.numpy())

@@ -196,11 +196,13 @@ def gallery(
     editor = SceneEditor(generator, batch_size=batch_size)
 
     def edit(scene_m: Tensor) -> dict[str, Tensor]:
-        ahead = regions.angle_box(projection, -30, 30, -25, 3)
-        beams = regions.dropped_beams(projection, range(0, projection.sensor.beams, 2))
+        """Results ``(N, H, W)`` of edits of a scene, by what they show."""
+        street_ahead = regions.angle_box(projection, -30, 30, -25, 3)
+        kept_rows = range(0, projection.sensor.beams, 2)
+        missing = regions.dropped_beams(projection, kept_rows)
         return {
-            "ahead generated anew": editor.inpaint(scene_m, ahead, 2, seed).range_m,
-            "every other beam filled": editor.complete(scene_m, beams, 1, seed).range_m,
+            "ahead generated anew": editor.inpaint(scene_m, street_ahead, 2, seed).range_m,
+            "every other beam filled": editor.complete(scene_m, missing, 1, seed).range_m,
             "varied": editor.vary(scene_m, 2, seed).range_m,
         }
 
