@@ -22,13 +22,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from r3dpa import __version__
-from r3dpa.checkpoints.networks import (
-    FACTS,
-    Checkpoint,
-    NetworkState,
-    path_of,
-    recorded_sampling,
-)
+from r3dpa.checkpoints.networks import Checkpoint, NetworkState, path_of, recorded_facts
 from r3dpa.checkpoints.official import OURS, from_official, is_official, statistics_of, to_official
 from r3dpa.class_paths import current_network
 from r3dpa.io import (
@@ -297,10 +291,9 @@ def _from_ours(path: Path) -> Checkpoint:
         about = yaml.safe_load(description.read_text())
         if not isinstance(about, dict) or about.get("format") != _FORMAT:
             raise ValueError(f"it does not describe a {_FORMAT}")
-        facts = {key: about[key] for key in ("step", "official_args", "left_out")}
-        facts |= {key: about[key] for key in FACTS if key in about}  # older files have fewer
         configs, sha256 = dict(about["networks"]), about["sha256"]
-        facts["sampling"] = recorded_sampling(facts, configs)
+        facts = {key: about[key] for key in ("step", "official_args", "left_out")}
+        facts |= recorded_facts(about, configs)
     if sha256 != sha256_of(path):
         raise ValueError(
             f"the file is not the one that {description.name} was written for (SHA-256 differs): "
@@ -333,8 +326,7 @@ def _from_lightning(content: Mapping[str, Any], path: Path) -> Checkpoint:
     prefixes = tuple(prefix for prefix, _ in _LIGHTNING.values())
     others = {key.split(".")[0] for key in weights if not key.startswith(prefixes)}
     facts = {"stage": arguments.get("_class_path", "unknown")}
-    facts |= {key: about[key] for key in FACTS if key in about}
-    facts["sampling"] = recorded_sampling(facts, {"sit": arguments.get("sit")})
+    facts |= recorded_facts(about, {"sit": arguments.get("sit")})
     return Checkpoint(
         path=path,
         networks=networks,

@@ -286,14 +286,20 @@ def _shorten(lines: list[str]) -> list[str]:
     return lines if rest <= 0 else [*lines[:_NUM_LISTED], f"... and {rest} more"]
 
 
-def recorded_sampling(facts: Mapping[str, Any], configs: Mapping[str, Any]) -> dict[str, Any]:
-    """Sampling settings of a checkpoint: a fact, or in older files an argument of its SiT."""
-    if facts.get("sampling") is not None:
-        return dict(facts["sampling"])
-    for name in ("ema", "sit"):
-        config = configs.get(name)
-        init_args = config.get("init_args") if isinstance(config, Mapping) else None
-        if init_args and init_args.get("guidance_block"):
-            scale = init_args.get("guidance_scale", 1.0)
-            return {"perturbed_attention": {"block": init_args["guidance_block"], "scale": scale}}
-    return {}
+def recorded_facts(about: Mapping[str, Any], configs: Mapping[str, Any]) -> dict[str, Any]:
+    """Facts of a checkpoint that its file records; earlier files have fewer.
+
+    Earlier versions recorded the sampling settings among the arguments of the SiT, which
+    ``configs`` hold by the name of the network.
+    """
+    facts = {key: about[key] for key in FACTS if key in about}
+    if facts.get("sampling") is None:
+        facts["sampling"] = {}
+        for name in ("sit", "ema"):
+            config = configs.get(name)
+            init_args = config.get("init_args") if isinstance(config, Mapping) else None
+            if init_args and init_args.get("guidance_block"):
+                scale = init_args.get("guidance_scale", 1.0)
+                settings = {"block": init_args["guidance_block"], "scale": scale}
+                facts["sampling"] = {"perturbed_attention": settings}
+    return facts

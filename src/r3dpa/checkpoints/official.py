@@ -17,13 +17,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from r3dpa.checkpoints.networks import (
-    FACTS,
-    Checkpoint,
-    NetworkState,
-    path_of,
-    recorded_sampling,
-)
+from r3dpa.checkpoints.networks import Checkpoint, NetworkState, path_of, recorded_facts
 from r3dpa.class_paths import current_network
 from r3dpa.nn.discriminator import PatchDiscriminator
 from r3dpa.nn.latent_norm import LatentNorm
@@ -131,14 +125,12 @@ def _from_ours(content: Mapping[str, Any], path: Path, sit_args: Options) -> Che
         config = current_network(config)
         init_args = {**config["init_args"], **(sit_args if name in ("sit", "ema") else {})}
         networks[name] = NetworkState(config["class_path"], init_args, weights).checked(name)
-    facts = {key: about[key] for key in FACTS if key in about}
-    facts["sampling"] = recorded_sampling(facts, about["networks"])
     return Checkpoint(
         path=path,
         networks=networks,
         step=content.get("steps"),
         official_args=about["official_args"],
-        **facts,
+        **recorded_facts(about, about["networks"]),
     )
 
 
