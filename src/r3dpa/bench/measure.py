@@ -54,10 +54,6 @@ class PairedTimings:
         """Whether the interval of the A/A ratio contains 1; if not, ratios are no evidence."""
         return self.repeat.low <= 1 <= self.repeat.high
 
-    def over_first(self, name: str) -> Ratio:
-        """Time of a case over the time of the first case."""
-        return Ratio.of(self.seconds[name], next(iter(self.seconds.values())))
-
 
 def compare(
     cases: Mapping[str, Callable[[], float]],

@@ -1,15 +1,38 @@
-"""Training of a small image VAE, where Stable Diffusion's is not at hand or too large."""
+"""Stages on RGB images: their base, and a small image VAE where Stable Diffusion's is too large."""
 
 from __future__ import annotations
 
+from typing import Any
+
 from torch import Tensor, nn
 
-from r3dpa.data.image_datamodule import ImageBatch
+from r3dpa.data.image_datamodule import ImageBatch, ImageDataModule
 from r3dpa.losses import reconstruction_errors, reconstruction_loss
-from r3dpa.modules.image_stage import ImageStage
 from r3dpa.modules.settings import LossWeights, OptimizerConfig
-from r3dpa.modules.stage import check_trainer, networks_as_settings
+from r3dpa.modules.stage import Stage, check_trainer, networks_as_settings
 from r3dpa.nn import ImageVAE
+
+
+class ImageStage(Stage):
+    """Base class of the stages trained on RGB images; their checkpoints record the image source."""
+
+    vae: ImageVAE
+
+    @property
+    def images(self) -> ImageDataModule:
+        """Data module, whose images are of a size that the VAE can encode."""
+        datamodule = getattr(self.trainer, "datamodule", None)
+        if not isinstance(datamodule, ImageDataModule):
+            raise ValueError(
+                f"{type(self).__name__} needs an ImageDataModule, got {type(datamodule).__name__}"
+            )
+        self.vae.latent_size((datamodule.image_size, datamodule.image_size))
+        return datamodule
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Add the images that it was trained with."""
+        super().on_save_checkpoint(checkpoint)
+        checkpoint["r3dpa"]["images"] = self.images.settings
 
 
 class ImageVAETraining(ImageStage):

@@ -14,7 +14,7 @@ from r3dpa.data.images import ImageEntry
 from r3dpa.data.posterior_cache import cache_posteriors
 from r3dpa.data.store import CachedTensors
 from r3dpa.features import DINOv2
-from r3dpa.modules.image_stage import ImageStage
+from r3dpa.modules.image_vae import ImageStage
 from r3dpa.modules.settings import LossWeights, OptimizerConfig, TimeSampling
 from r3dpa.modules.stage import check_latents, check_trainer, networks_as_settings
 from r3dpa.nn import EMA, ImageVAE, LatentNorm, Posterior, SiT
