@@ -22,6 +22,7 @@ from r3dpa.bench.training import (
 )
 from r3dpa.callbacks import EMASnapshots
 from r3dpa.data.datamodules import LidarDataModule, SimulatedDataModule
+from r3dpa.data.range_images import SimulatedImageDataModule
 from r3dpa.features import GeometricFeatures
 from r3dpa.modules import GenerativeModule
 
@@ -143,7 +144,10 @@ class DryRun:
         try:
             train, val = data.limited_split()
             num_scans = len(train) + len(val)
-            scan_bytes = sum(scan.path.stat().st_size for scan in train + val)
+            if isinstance(data, SimulatedImageDataModule):
+                scan_bytes = num_scans * data.image_bytes
+            else:
+                scan_bytes = sum(scan.path.stat().st_size for scan in train + val)
             parts = [f"{num_scans:,} scans, {_size(scan_bytes)}"]
         except ValueError as error:  # before they are downloaded or simulated
             if not isinstance(data, SimulatedDataModule):

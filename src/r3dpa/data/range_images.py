@@ -152,6 +152,11 @@ class SimulatedImageDataModule(SimulatedDataModule):
         return points_of(self.images.read(scan).range_m, self._known_projection)
 
     @property
+    def image_bytes(self) -> int:
+        """Size of a cached image."""
+        return self._store.row_bytes
+
+    @property
     def _with_values(self) -> bool:
         """Whether intensity and class are cached beside the range."""
         return self.codec.intensity_channel or self.codec.num_classes > 0
