@@ -21,7 +21,6 @@ from lightning.pytorch.utilities import rank_zero_info, rank_zero_only
 
 from r3dpa.bench.dry_run import DryRun, batch_lines
 from r3dpa.callbacks import RunCheckpoint, SceneScorer
-from r3dpa.callbacks.loss_bar import LossBar
 from r3dpa.checkpoints import read_checkpoint
 from r3dpa.cli.parser import Parser
 from r3dpa.cli.presets import expand_preset, find_configs
@@ -44,6 +43,7 @@ _HARMLESS = (
 )
 
 
+_TRAIN = "train/"  # in front of the names of losses
 _NOTICES = ("GPU available: False", "TPU available:", "HPU available:", "💡 Tip:", "Seed set to")
 _NOTICE_LOGGERS = ("lightning.pytorch.utilities.rank_zero", "lightning.fabric.utilities.seed")
 # What to do after a stage: the command that takes its checkpoint.
@@ -102,6 +102,23 @@ def _prefer_whole_numbers(parser: LightningArgumentParser) -> None:
     for action in actions:
         if getattr(action, "_typehint", None) == int | float | None:
             action._typehint = int | float | None
+
+
+class _LossBar(TQDMProgressBar):
+    """Progress bar that shows the last training losses instead of the version of the logger."""
+
+    def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict[str, Any]:
+        """Return the losses by name without ``train/``, the total one first."""
+        shown = super().get_metrics(trainer, pl_module)
+        shown.pop("v_num", None)
+        losses = {
+            name.removeprefix(_TRAIN): f"{value.item():.3g}"
+            for name, value in trainer.callback_metrics.items()
+            if name.startswith(_TRAIN) and name != f"{_TRAIN}skipped_steps"
+        }
+        shown.pop(f"{_TRAIN}loss", None)
+        total = {"loss": losses["loss"]} if "loss" in losses else {}
+        return total | losses | shown
 
 
 class _RecordConfig(SaveConfigCallback):
@@ -202,7 +219,7 @@ class StageCLI(LightningCLI):
         for logger in trainer.loggers:
             if isinstance(logger, WandbLogger):  # wandb warns of it, even if it is None
                 logger._wandb_init.pop("anonymous", None)
-        callbacks = [LossBar() if type(c) is TQDMProgressBar else c for c in trainer.callbacks]
+        callbacks = [_LossBar() if type(c) is TQDMProgressBar else c for c in trainer.callbacks]
         trainer.callbacks = sorted(callbacks, key=lambda c: not isinstance(c, _RecordConfig))
         return cast(Trainer, trainer)
 

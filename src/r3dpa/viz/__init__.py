@@ -6,6 +6,7 @@ Colours are safe for colour-blind readers, on scales fixed in metres. Dark means
 from r3dpa.viz.curves import (
     ParetoPoint,
     Series,
+    beam_residuals,
     loss_curves,
     pareto_figure,
     read_curves,
@@ -30,7 +31,6 @@ from r3dpa.viz.pictures import (
     save,
     scene_3d,
 )
-from r3dpa.viz.sensors import beam_residuals
 
 __all__ = [
     "Category",

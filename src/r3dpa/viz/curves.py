@@ -1,4 +1,4 @@
-"""Logged quantities of a run as curves, and what accuracy costs in time."""
+"""Figures of numbers: logged quantities of a run, accuracy against time, beams of a sensor."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 from numpy.typing import NDArray
+
+from lidarsim.sensors.estimation import SensorEstimate
 
 Series = tuple[Sequence[float], Sequence[float]]
 
@@ -203,4 +205,29 @@ def pareto_figure(
     axes.set_ylim(min(values) / (max(values) / min(values)) ** 0.13 / 1.1, None)
     axes.grid(alpha=0.25, which="major")
     figure.suptitle(title, fontsize=12, x=0.02, ha="left")
+    return figure
+
+
+def beam_residuals(estimate: SensorEstimate) -> Figure:
+    """Draw the residuals of each beam, its optical centre and its azimuth offset."""
+    lasers = estimate.sensor.lasers
+    inclination_deg = np.degrees(lasers.inclination_rad)
+    low, lower, middle, upper, high = estimate.residual_deg.T
+    figure = Figure(figsize=(10, 6), layout="constrained")
+    residuals, heights, offsets = figure.subplots(1, 3, sharey=True, width_ratios=(2, 1, 1))
+    residuals.hlines(inclination_deg, low, high, color=COLOURS[4], linewidth=1, label="5 to 95 %")
+    residuals.hlines(
+        inclination_deg, lower, upper, color=COLOURS[0], linewidth=3, label="25 to 75 %"
+    )
+    residuals.plot(middle, inclination_deg, "|", color=COLOURS[11], label="median")
+    residuals.set(xlabel="residual, degrees", ylabel="inclination of the beam, degrees")
+    residuals.legend(loc="best", fontsize="small")
+    heights.plot(lasers.height_m, inclination_deg, ".", color=COLOURS[5])
+    heights.set(xlabel="optical centre, m")
+    offsets.plot(np.degrees(lasers.azimuth_offset_rad), inclination_deg, ".", color=COLOURS[2])
+    offsets.set(xlabel="azimuth offset, degrees")
+    figure.suptitle(
+        f"{len(inclination_deg)} beams by {estimate.beams_by}, {estimate.sensor.shots} columns, "
+        f"{estimate.num_scans} scans"
+    )
     return figure
