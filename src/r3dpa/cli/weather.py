@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -30,6 +31,8 @@ from r3dpa.io import (
 )
 
 _REQUEST, _LINES, _REPORT, _PAGE = "request.json", ".unfinished.jsonl", "report.jsonl", "scans.html"
+Change = Callable[[RecordedScan, Any], WeatheredScan]
+"""Weather or fault of a scan, drawn by a seed and the name of the scan."""
 _LOST, _MOVED = 254, 255  # colours of the page, beside the values of Origin
 
 
@@ -55,9 +58,9 @@ def weather(
         effects: ``off`` or ``on`` by effect, such as ``--effects.range_noise on``.
         **options: See :class:`FolderOptions`.
     """
+    change = partial(weather.apply, instrument=instrument, effects=effects)
     # An error in the request must not be reported as one in the first scan.
-    weather.apply(RecordedScan(np.ones((1, 3), np.float32)), 0, instrument, effects=effects)
-    change = weather, instrument, effects
+    change(RecordedScan(np.ones((1, 3), np.float32)), 0)
     conditions = weather_to_dict(weather) | {"traffic_m_s": weather.traffic_m_s}
     about = {"weather": conditions, "instrument": asdict(instrument)}
     return _run(source, change, about | {"effects": effects}, FolderOptions(**options))
@@ -81,7 +84,7 @@ def corrupt(
         **options: See :class:`FolderOptions`.
     """
     change = Fault(fault, severity, strength)
-    return _run(source, change, asdict(change), FolderOptions(**options))
+    return _run(source, change.apply, asdict(change), FolderOptions(**options))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,7 +114,7 @@ class _FolderRun:
     """Change of a run; a call applies it to a scan, writes the result and returns a report line."""
 
     root: Path
-    change: Fault | tuple[Weather, Instrument, Mapping[str, str | bool] | None]
+    change: Change
     options: FolderOptions
 
     def name(self, path: Path) -> str:
@@ -125,11 +128,7 @@ class _FolderRun:
         cloud.check_metres()
         key, scan = (self.options.seed, self.name(path)), recorded_scan(cloud)
         try:
-            if isinstance(self.change, Fault):
-                result = self.change.apply(scan, key)
-            else:
-                weather, instrument, effects = self.change
-                result = weather.apply(scan, key, instrument, effects=effects)
+            result = self.change(scan, key)
         except ValueError as error:
             raise ScanError(f"{path}: {error}") from error
         if not len(result.points):
@@ -155,7 +154,7 @@ class _FolderRun:
         return files | about | {"written": len(result.points)}
 
 
-def _run(source: Path, change: Any, request: dict[str, Any], options: FolderOptions) -> str:
+def _run(source: Path, change: Change, request: dict[str, Any], options: FolderOptions) -> str:
     from lidarsim.changed_scans import inputs_of
     from lidarsim.clouds import find_files
     from lidarsim.scan_files import ScanError
