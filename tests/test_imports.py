@@ -15,9 +15,11 @@ PACKAGES = ("lidarsim", "r3dpa")
 CORE = {"geometry", "flow", "losses", "nn"}
 METHOD = CORE | {"features", "data", "checkpoints", "generation", "editing", "lidarsim"}
 METHOD |= {"scenes", "scene_vae", "pretrained", "modules"}
+METRICS = {"metrics", "feature_spaces"}
 ALLOWED = {
     "lidarsim": set(),
     "class_paths": set(),
+    "feature_spaces": set(),
     "pretrained": set(),
     "losses": set(),
     "io": {"lidarsim"},  # atomic writes, locks, worker processes
@@ -45,15 +47,16 @@ ALLOWED = {
         "lidarsim",
     },
     "modules": METHOD,
-    "metrics": {"geometry", "nn", "features", "lidarsim"},  # divergences that realism has, too
+    # Divergences that realism has, too.
+    "metrics": {"geometry", "nn", "features", "lidarsim", "feature_spaces"},
     "viz": METHOD | {"metrics"},
     "baselines": METHOD,
     "stages": {"flow", "checkpoints", "generation", "baselines"},
-    "callbacks": METHOD | {"metrics", "viz"},
-    "ablation": METHOD | {"metrics", "viz", "callbacks"},
+    "callbacks": METHOD | METRICS | {"viz"},
+    "ablation": METHOD | METRICS | {"viz", "callbacks"},
     "bench": METHOD | {"metrics", "viz", "callbacks", "stages"},
     "__main__": {"cli"},
-    "cli": METHOD | {"metrics", "viz", "callbacks", "stages", "bench", "ablation", "class_paths"},
+    "cli": METHOD | METRICS | {"viz", "callbacks", "stages", "bench", "ablation", "class_paths"},
 }
 ANYWHERE = {"io", "__version__"}
 

@@ -9,7 +9,6 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
-from scipy.signal import find_peaks
 
 from lidarsim.recorded import RecordedScan, angles
 from lidarsim.ring_order import rings_in_order
@@ -129,6 +128,8 @@ def _nearest_ring(inclination: NDArray[np.float64], known: NDArray[np.int64]) ->
 
 def _by_inclination(inclination: NDArray[np.float64]) -> tuple[NDArray[np.int64], How, float]:
     """Rings by the peaks of the histogram, and the share of points near their middle."""
+    from scipy.signal import find_peaks  # half a second, which most commands do not need
+
     angle = np.degrees(inclination) / _BIN_DEG
     first = math.floor(angle.min()) - 10
     place = np.floor(angle).astype(np.int64) - first

@@ -7,11 +7,14 @@ import sys
 import time
 
 import pytest
+import yaml
 
 from r3dpa.cli import ALIASES, COMMANDS, OWN_PARSER, main
-from r3dpa.cli.fit import _check_trainer_option
+from r3dpa.cli.class_arguments import class_arguments
+from r3dpa.cli.fit import _check_class_arguments, _check_trainer_option
+from r3dpa.cli.messages import _argument_names
 from r3dpa.cli.parser import load, make_parser
-from r3dpa.cli.presets import expand_preset, stage_files
+from r3dpa.cli.presets import conf_folder, expand_preset, stage_files
 
 MISTAKES = {
     "fit": "give a stage, or --config FILE",
@@ -24,6 +27,9 @@ MISTAKES = {
     "fit --config no.yaml": "--config: no file no.yaml",
     "fit joint --trainer.max_stepz 3": "--trainer.max_stepz (did you mean --trainer.max_steps?)",
     "fit joint --trainer.loger+=x": "--trainer.loger+ (did you mean --trainer.logger?)",
+    "fit joint --data.init_args.bach_size 3": "data.init_args.bach_size (did you mean batch_size?)",
+    "fit joint --preset images --data.soruce x": "--data.soruce (did you mean source?)",
+    "fit joint --model.init_args.init_fron x": "init_args.init_fron (did you mean init_from?)",
     "data features --trainer.devises 4": "--trainer.devises (did you mean --trainer.devices?)",
     "smaple": "unknown command 'smaple' (did you mean sample?)",
     "inpant": "unknown command 'inpant' (did you mean inpaint?)",
@@ -38,6 +44,9 @@ MISTAKES = {
     "data weather no --out x": "no: no such file or folder",
     "data features --data no/data": "--data no/data: no such folder of scans or data YAML",
     "data reference --data no --out x.safetensors": "--data no: no such file or folder",
+    "data reference --data . --out x --spaces frud": "--spaces: unknown value 'frud'; choose from",
+    "data weather . --out x --weather.visiblity_m 60": "(did you mean --weather.visibility_m?)",
+    "data convert . out --to xyz": "--to: unknown value 'xyz'; choose from bin, pcd.bin, ply",
     "convert no.pt x.safetensors": "no.pt: no such file or folder",
     "report no": "no: no such file or folder",
     "ablate nowhere": "nowhere: no table or folder of tables; choose from conf/ablation",
@@ -49,7 +58,7 @@ MISTAKES = {
 
 @pytest.fixture(scope="module")
 def answers(tmp_path_factory):
-    """Answers to the mistakes in one process, and whether torch was imported for one of them."""
+    """Answers to the mistakes in one process, and slow packages imported up to each of them."""
     program = f"""
 import sys, json, io, contextlib, pathlib
 from r3dpa.cli import main
@@ -62,7 +71,7 @@ for line in {list(MISTAKES)}:
         try: main(line.split())
         except SystemExit: pass
         except (ValueError, OSError) as error: text.write(str(error))
-    answers.append([text.getvalue(), "torch" in sys.modules])
+    answers.append([text.getvalue(), sorted({{"torch", "scipy.signal"}} & set(sys.modules))])
 print(json.dumps(answers))
 """
     folder = tmp_path_factory.mktemp("mistakes")
@@ -75,9 +84,9 @@ print(json.dumps(answers))
 
 @pytest.mark.parametrize("line", list(MISTAKES))
 def test_a_simple_mistake_is_answered_before_torch_is_imported(line, answers):
-    answer, imported_torch = answers[line]
+    answer, slow_imports = answers[line]
     assert MISTAKES[line] in answer
-    assert not imported_torch
+    assert not slow_imports
 
 
 def test_known_options_of_the_trainer_are_left_to_its_parser():
@@ -87,6 +96,37 @@ def test_known_options_of_the_trainer_are_left_to_its_parser():
         "--trainer.logger.init_args.name",
     ):
         _check_trainer_option("fit", option)
+
+
+def test_known_arguments_of_classes_are_left_to_the_parser():
+    """The source names at least the arguments that the parser finds in the imported class."""
+    configs = [*stage_files().values(), *(conf_folder() / "data").glob("*.yaml")]
+    sections = [yaml.safe_load(path.read_text()) for path in configs]
+    classes = {
+        section[group]["class_path"]
+        for section in sections
+        for group in ("model", "data")
+        if "class_path" in section.get(group, {})
+    }
+    assert {"r3dpa.data.SimulatedDataModule", "r3dpa.modules.JointAlignment"} <= classes
+    for class_path in classes:
+        accepted = {name.partition(".")[0] for name in _argument_names(class_path)} - {"help"}
+        assert accepted <= set(class_arguments(class_path))
+    assert not class_arguments("torch.nn.Linear")
+
+
+def test_the_class_of_the_data_is_the_last_one_that_is_named(tmp_path):
+    images = tmp_path / "images.yaml"
+    images.write_text("data: {class_path: r3dpa.data.ImageDataModule}")
+    words = ["--config", str(images), "--data.init_args.grid_size", "3"]
+    with pytest.raises(SystemExit):
+        _check_class_arguments("fit", words)
+    folder = ["-c", "conf/data/folder.yaml", "--data.init_args.grid_size", "3"]
+    _check_class_arguments("fit", ["--config", str(images), *folder])
+    _check_class_arguments("fit", [*words, "--data", "LidarDataModule"])
+    _check_class_arguments("fit", [*words, "--data", "my_package.LidarDataModule"])
+    images.write_text("data: {")  # reported by the parser, which names the file and the line
+    _check_class_arguments("fit", words)
 
 
 def test_fit_alone_names_stages_and_presets(answers):

@@ -16,6 +16,7 @@ import torch
 
 from r3dpa import viz
 from r3dpa.ablation.plan import Plan, PlannedStage, Row, Table
+from r3dpa.feature_spaces import SPACES
 from r3dpa.io import command, machine, versions, write_text
 from r3dpa.metrics.resampling import Ends, quantile_of_t
 from r3dpa.metrics.results import (
@@ -24,7 +25,6 @@ from r3dpa.metrics.results import (
     published_evaluation,
     save_csv,
 )
-from r3dpa.metrics.scene_features import SPACES
 
 _DISTANCES = ("JSD", "MMD", *(space.upper() for space in SPACES))
 _ALIKE = 0.05  # share; a few times the differences of such rows in the paper

@@ -17,6 +17,7 @@ from tqdm import tqdm
 
 from r3dpa.data import Scan
 from r3dpa.data.datamodules import LidarDataModule
+from r3dpa.feature_spaces import FREE_SPACES
 from r3dpa.generation import SamplerConfig
 from r3dpa.geometry import points_of
 from r3dpa.io import atomic_path, source_commit
@@ -32,7 +33,7 @@ from r3dpa.metrics.evaluation import (
 from r3dpa.metrics.reference import ReferenceStatistics, cards_of, compute_reference
 from r3dpa.metrics.results import report, save_reports
 from r3dpa.metrics.scene import PROTOCOLS, EvaluationScene
-from r3dpa.metrics.scene_features import FREE_SPACES, SceneFeatures
+from r3dpa.metrics.scene_features import SceneFeatures
 from r3dpa.viz.evaluation import save_figures
 
 if TYPE_CHECKING:

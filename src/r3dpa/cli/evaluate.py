@@ -12,13 +12,14 @@ from typing import Any, Literal
 from jsonargparse.typing import PositiveInt
 
 from r3dpa.cli.parser import check_file, check_folder
+from r3dpa.feature_spaces import FeatureSpace
 
 
 def reference(
     *,
     data: Path,
     out: Path,
-    spaces: tuple[str, ...] = ("fwid", "fgeo"),
+    spaces: tuple[FeatureSpace, ...] = ("fwid", "fgeo"),
     ckpt: dict[str, Path] | None = None,
     split: Literal["train", "val", "all"] = "all",
     limit: PositiveInt | None = None,
@@ -84,7 +85,7 @@ def evaluate(
     *,
     samples: Path,
     reference: Path,
-    spaces: list[str] | None = None,
+    spaces: list[FeatureSpace] | None = None,
     ckpt: dict[str, Path] | None = None,
     skip_bad: bool = False,
     allow_few: bool = False,

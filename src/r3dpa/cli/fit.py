@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import ast
 import sys
 from collections.abc import Iterator
-from importlib.util import find_spec
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import NoReturn
 
+import yaml
+
+from r3dpa.cli.class_arguments import class_arguments, trainer_arguments
 from r3dpa.cli.messages import suggestion
 from r3dpa.cli.presets import (
     DEFAULT_PRESET,
@@ -61,6 +63,7 @@ _CHECKPOINT_OPTIONS = (
     "--model.init_args.init_from",
     "--model.init_args.rgb_weights",
 )
+_CLASS_KEYS = ("class_path", "init_args", "dict_kwargs", "help")  # beside arguments of a class
 _CHECKPOINT_WORDS = ("last", "best", "hpc", "null")  # of --ckpt_path, beside files
 
 
@@ -82,7 +85,8 @@ def run(args: list[str]) -> None:
     elif not _names_stage(words):
         sys.stderr.write(f"{overview}\n\n")
         _refuse(command, "give a stage, or --config FILE")
-    expand_preset(words)  # refuses an unknown stage or preset
+    expanded = expand_preset(words)  # refuses an unknown stage or preset
+    _check_class_arguments(command, expanded.words)
     from r3dpa.cli.stages import run as run_stage
 
     run_stage(args)
@@ -141,8 +145,8 @@ def _options(words: list[str]) -> Iterator[tuple[str, str]]:
     """Options and the word after each, or the text after its ``=``."""
     for word, following in pairwise([*words, ""]):
         option, equals, value = word.partition("=")
-        if option.startswith("--"):
-            yield option, value if equals else following
+        if option.startswith("--") or option == "-c":
+            yield "--config" if option == "-c" else option, value if equals else following
 
 
 def _check_option(command: str, option: str, known: tuple[str, ...]) -> None:
@@ -159,23 +163,38 @@ def _check_trainer_option(command: str, option: str) -> None:
     group, _, keys = option.partition(".")
     name = keys.partition(".")[0].rstrip("+")
     if group == "--trainer" and name:
-        known = ["help", *_trainer_arguments()]
+        known = ["help", *trainer_arguments()]
         if not any(argument.startswith(name) for argument in known):
             near = suggestion(name, known, "--trainer.")
             _refuse(command, f"unknown option {option}{near}")
 
 
-def _trainer_arguments() -> list[str]:
-    """Arguments of Lightning's trainer, from its source: its import takes seconds."""
-    package = find_spec("lightning")
-    assert package is not None
-    assert package.origin is not None
-    source = Path(package.origin).with_name("pytorch") / "trainer" / "trainer.py"
-    tree = ast.parse(source.read_text(encoding="utf-8"))
-    (trainer,) = (node for node in tree.body if isinstance(node, ast.ClassDef))
-    functions = [node for node in trainer.body if isinstance(node, ast.FunctionDef)]
-    (init,) = (function for function in functions if function.name == "__init__")
-    return [argument.arg for argument in (*init.args.args[1:], *init.args.kwonlyargs)]
+def _check_class_arguments(command: str, words: list[str]) -> None:
+    """Refuse an option that names no argument of the class of the model or the data."""
+    for option, _ in _options(words):
+        group, _, keys = option[2:].partition(".")
+        name = keys.removeprefix("init_args.").partition(".")[0].rstrip("+")
+        if group in ("model", "data") and name not in ("", *_CLASS_KEYS):
+            known = class_arguments(_class_path(group, words))
+            if known and name not in known:
+                _refuse(command, f"unknown option {option}{suggestion(name, known)}")
+
+
+def _class_path(group: str, words: list[str]) -> str:
+    """Class of the model or the data that the words choose last; empty if that is not plain."""
+    class_path = ""
+    for option, value in _options(words):
+        if option == "--config" and value.endswith((".yaml", ".yml")):
+            with suppress(yaml.YAMLError):  # which the parser reports
+                config = yaml.safe_load(shipped(value).read_text())
+                section = config.get(group) if isinstance(config, dict) else None
+                if isinstance(section, str):
+                    class_path = section
+                elif isinstance(section, dict):
+                    class_path = section.get("class_path", class_path)
+        elif option in (f"--{group}", f"--{group}.class_path"):
+            class_path = value
+    return class_path
 
 
 def _check_words(command: str, words: list[str]) -> None:

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import torch
 
+from r3dpa.feature_spaces import FREE_SPACES
 from r3dpa.io import source_commit
 from r3dpa.metrics.collection import (
     batches_with_features,
@@ -26,7 +27,7 @@ from r3dpa.metrics.reference import ReferenceStatistics
 from r3dpa.metrics.resampling import Resampling
 from r3dpa.metrics.results import Evaluation, MetricResult
 from r3dpa.metrics.scene import DEFAULT, EvaluationScene, Protocol, usable_scenes
-from r3dpa.metrics.scene_features import FREE_SPACES, SceneFeatures, feature_spaces, scene_features
+from r3dpa.metrics.scene_features import SceneFeatures, feature_spaces, scene_features
 
 AnyReference = ReferenceStatistics | OfficialStatistics
 

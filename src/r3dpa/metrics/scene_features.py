@@ -29,6 +29,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from r3dpa.feature_spaces import FREE_SPACES, SPACES
 from r3dpa.features import GeometricFeatures, WaffleIronS
 from r3dpa.features.geometric import CENTRES
 from r3dpa.features.scalr import sha256
@@ -42,21 +43,6 @@ from r3dpa.metrics.networks.rangevit import RangeViT, range_channels
 from r3dpa.metrics.networks.sparse import NUM_BINS, pool_voxels, voxelize
 from r3dpa.metrics.scene import DEFAULT, EvaluationScene, Protocol
 
-#: Names that :func:`scene_features` knows.
-SPACES = (
-    "frid",
-    "fld",
-    "fsvd",
-    "fpvd",
-    "fwid",
-    "fgeo",
-    "frd",
-    "frid_r2flow",
-    "frid_lidm",
-    "fpd",
-)
-#: Spaces that need no weights from elsewhere.
-FREE_SPACES = ("fwid", "fgeo")
 # Generated scenes have no intensity: all points get the mean of real scans.
 _INTENSITY = CENTRES[-1]
 
@@ -65,7 +51,7 @@ _INTENSITY = CENTRES[-1]
 class SceneFeatures:
     """A frozen network as a map from scenes to vectors."""
 
-    name: str  #: one of :data:`SPACES`
+    name: str  #: one of :data:`r3dpa.feature_spaces.SPACES`
     dim: int  #: width F of the features
     card: dict[str, Any]  #: ``backbone``, ``layer``, ``weights`` (SHA-256), ``preprocessing``
     extract: Callable[[Sequence[EvaluationScene]], Tensor]  #: ``(B, F)``, of :func:`through_sensor`
