@@ -15,18 +15,18 @@ PACKAGES = ("lidarsim", "r3dpa")
 CORE = {"geometry", "flow", "losses", "nn"}
 METHOD = CORE | {"features", "data", "checkpoints", "generation", "editing", "lidarsim"}
 METHOD |= {"scenes", "scene_vae", "pretrained", "modules"}
-METRICS = {"metrics", "feature_spaces"}
+METRICS = {"metrics", "feature_names"}
 ALLOWED = {
     "lidarsim": set(),
     "class_paths": set(),
-    "feature_spaces": set(),
+    "feature_names": set(),
     "pretrained": set(),
     "losses": set(),
     "io": {"lidarsim"},  # atomic writes, locks, worker processes
     "geometry": {"lidarsim"},  # LidarSensor, rings of a scan
     "flow": {"losses"},
     "nn": {"geometry", "losses"},
-    "features": {"geometry", "nn"},
+    "features": {"geometry", "nn", "feature_names"},
     "data": {"geometry", "features", "lidarsim"},
     "checkpoints": {"geometry", "nn", "pretrained", "class_paths"},
     # A batch of scenes writes its files and shows its pages.
@@ -48,7 +48,7 @@ ALLOWED = {
     },
     "modules": METHOD,
     # Divergences that realism has, too.
-    "metrics": {"geometry", "nn", "features", "lidarsim", "feature_spaces"},
+    "metrics": {"geometry", "nn", "features", "lidarsim", "feature_names"},
     "viz": METHOD | {"metrics"},
     "baselines": METHOD,
     "stages": {"flow", "checkpoints", "generation", "baselines"},

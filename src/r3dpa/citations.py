@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from importlib.resources import files
+from pathlib import Path
 
 from r3dpa.pretrained import DEFAULT_WEIGHTS
 
@@ -25,7 +26,7 @@ _OF_FEATURES = {
 }
 
 
-def cite(ckpt: str = DEFAULT_WEIGHTS) -> str:
+def cite(ckpt: Path = Path(DEFAULT_WEIGHTS)) -> str:
     """Print BibTeX of the method, networks and features that a checkpoint was made with.
 
     The data set is not known from a checkpoint: add the reference of yours.

@@ -42,11 +42,16 @@ MISTAKES = {
     "data features --data . --extracter x": "--extracter (did you mean --extractor?)",
     "data view no": "no: no such file or folder",
     "data weather no --out x": "no: no such file or folder",
+    "data sensor no --out s.yaml": "no: no such file or folder",
     "data features --data no/data": "--data no/data: no such folder of scans or data YAML",
     "data reference --data no --out x.safetensors": "--data no: no such file or folder",
     "data reference --data . --out x --spaces frud": "--spaces: unknown value 'frud'; choose from",
     "data weather . --out x --weather.visiblity_m 60": "(did you mean --weather.visibility_m?)",
     "data convert . out --to xyz": "--to: unknown value 'xyz'; choose from bin, pcd.bin, ply",
+    "data features --data . --extractor scalar": "unknown feature source 'scalar' (did you mean sc",
+    "data plan no.yaml --scans . --out x": "unknown sensor 'no.yaml'; choose from",
+    "cite --ckpt no.ckpt": "no checkpoint file no.ckpt",
+    "completion zsh": "r3dpa completion: shell: unknown value 'zsh'; choose from bash",
     "convert no.pt x.safetensors": "no.pt: no such file or folder",
     "report no": "no: no such file or folder",
     "ablate nowhere": "nowhere: no table or folder of tables; choose from conf/ablation",
@@ -87,6 +92,10 @@ def test_a_simple_mistake_is_answered_before_torch_is_imported(line, answers):
     answer, slow_imports = answers[line]
     assert MISTAKES[line] in answer
     assert not slow_imports
+
+
+def test_a_file_that_needs_no_option_is_named_without_one(answers):
+    assert answers["data sensor no --out s.yaml"][0] == "no: no such file or folder"
 
 
 def test_known_options_of_the_trainer_are_left_to_its_parser():

@@ -16,7 +16,7 @@ import torch
 
 from r3dpa import viz
 from r3dpa.ablation.plan import Plan, PlannedStage, Row, Table
-from r3dpa.feature_spaces import SPACES
+from r3dpa.feature_names import SPACES
 from r3dpa.io import command, machine, versions, write_text
 from r3dpa.metrics.resampling import Ends, quantile_of_t
 from r3dpa.metrics.results import (

@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 from r3dpa.data import Scan
 from r3dpa.data.datamodules import LidarDataModule
-from r3dpa.feature_spaces import FREE_SPACES
+from r3dpa.feature_names import FREE_SPACES
 from r3dpa.generation import SamplerConfig
 from r3dpa.geometry import points_of
 from r3dpa.io import atomic_path, source_commit

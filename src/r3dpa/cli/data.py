@@ -245,6 +245,9 @@ def plan(
         workers: Processes.
     """
     check_folder(out)
+    from lidarsim.sensors import load_sensor
+
+    load_sensor(sensor)  # refuses an unknown one before torch is imported
     from r3dpa.data.sensor_plan import SensorPlan
 
     # YAML cannot hold the number types of options.

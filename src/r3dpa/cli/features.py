@@ -20,7 +20,8 @@ from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.data.feature_grids import features_lock, plan
 from r3dpa.data.range_images import SimulatedImageDataModule
 from r3dpa.data.scans import Scan
-from r3dpa.features.scalr import SOURCES, feature_source
+from r3dpa.feature_names import SOURCES
+from r3dpa.features.scalr import feature_source
 from r3dpa.geometry import Projection
 from r3dpa.modules.feature_extraction import FeatureExtraction
 from r3dpa.modules.stage import check_trainer

@@ -15,11 +15,13 @@ from r3dpa.cli.class_arguments import class_arguments, trainer_arguments
 from r3dpa.cli.messages import suggestion
 from r3dpa.cli.presets import (
     DEFAULT_PRESET,
+    check_known,
     expand_preset,
     preset_names,
     shipped,
     stage_files,
 )
+from r3dpa.feature_names import SOURCES
 from r3dpa.pretrained import weights_file
 
 # Options of the stage commands and of Lightning, or the first part of their names.
@@ -96,11 +98,13 @@ def features(args: list[str]) -> None:
     """Run ``data features``, given its name and the words after it.
 
     Raises:
-        ValueError: If the data do not exist.
+        ValueError: If the data do not exist, or the feature source is unknown.
     """
     for option, value in _options(args[1:]):
         if option == "--data" and "/" in value and not Path(value).exists():
             raise ValueError(f"--data {value}: no such folder of scans or data YAML")
+        if option == "--extractor":
+            check_known("feature source", value, SOURCES)
         _check_option("data features", option, _FEATURE_OPTIONS)
     from r3dpa.cli.features import features as write_features
 

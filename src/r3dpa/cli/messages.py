@@ -75,7 +75,8 @@ def describe_error(
         return f"unknown option --{place}{name}{suggestion(name, _argument_names(owner))}"
     if not keys:
         return _plain(reason)
-    names = next((list(a.option_strings) for a in parser._actions if a.dest == keys[0]), [])
+    named = [action for action in parser._actions if action.dest == keys[0]]
+    names = [name for action in named for name in action.option_strings or [action.dest]]
     typed = [name for name in names if name in words] or names or [f"--{keys[0]}"]
     return f"{'.'.join([typed[0], *keys[1:]])}: {_plain(reason)}"
 

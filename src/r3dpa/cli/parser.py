@@ -45,8 +45,12 @@ def _load_yaml_of_any_version(text: str) -> Any:
 set_loader("yaml", _load_yaml_of_any_version, (yaml.YAMLError,))
 # One word for one thing in all commands; the function's own name is an option as well.
 _COMMON_NAMES = {"limit": "--num", "frames": "--num", "scenes": "--num", "jobs": "--workers"}
-# Files and folders that must exist: options, and words without one.
-_INPUT_OPTIONS = (
+# Arguments whose files and folders must exist.
+_INPUTS = (
+    "source",
+    "path",
+    "run",
+    "file",
     "scan",
     "left",
     "right",
@@ -57,7 +61,6 @@ _INPUT_OPTIONS = (
     "scans",
     "data",
 )
-_INPUT_WORDS = ("source", "path", "run", "file")
 
 
 class HelpFormatter(DefaultHelpFormatter):
@@ -227,19 +230,20 @@ def run_function(function: Callable[..., Any], words: Sequence[str], prog: str) 
     parser, config = parse(function, words, prog)
     arguments = parser.instantiate(config).as_dict()
     arguments.pop("config", None)
-    _check_inputs(arguments)
+    _check_inputs(parser, arguments)
     return function(**arguments)
 
 
-def _check_inputs(arguments: Mapping[str, Any]) -> None:
+def _check_inputs(parser: Parser, arguments: Mapping[str, Any]) -> None:
     """Refuse files that do not exist, before torch is imported, which takes seconds."""
     ckpt = arguments.get("ckpt")
     if isinstance(ckpt, Path) and not str(ckpt).startswith("hf:/"):
         weights_file(ckpt)
-    for name in (*_INPUT_WORDS, *_INPUT_OPTIONS):
+    options = {action.dest for action in parser._actions if action.option_strings}
+    for name in _INPUTS:
         path = arguments.get(name)
         if isinstance(path, Path) and not path.exists():
-            option = f"--{name} " if name in _INPUT_OPTIONS else ""
+            option = f"--{name} " if name in options else ""
             raise ValueError(f"{option}{path}: no such file or folder")
 
 

@@ -69,8 +69,8 @@ def expand_preset(words: list[str]) -> StageWords:
         preset = rest[place + 1]
         del rest[place : place + 2]
     conf, demo, stages = conf_folder(), preset == "demo", stage_files()
-    _check_known("stage", stage, list(stages))
-    _check_known("preset", preset, preset_names())
+    check_known("stage", stage, list(stages))
+    check_known("preset", preset, preset_names())
     data = "dead_leaves" if demo and stage in ("image_vae", "rgb_pretraining") else preset
     configs = [conf / "trainer.yaml", conf / "data" / f"{data}.yaml", stages[stage]]
     if demo:
@@ -86,7 +86,8 @@ def preset_names() -> list[str]:
     return [path.stem for path in sorted((conf_folder() / "data").glob("*.yaml"))]
 
 
-def _check_known(kind: str, name: str, known: list[str]) -> None:
+def check_known(kind: str, name: str, known: Sequence[str]) -> None:
+    """Refuse a name that is not known."""
     if name not in known:
         near = suggestion(name, known)
         raise ValueError(f"unknown {kind} '{name}'{near}; choose from {', '.join(known)}")

@@ -1,8 +1,9 @@
 """Frozen extractors of 3D point features that the method aligns with."""
 
+from r3dpa.feature_names import SOURCES
 from r3dpa.features.dinov2 import DINOv2
 from r3dpa.features.geometric import GeometricFeatures
-from r3dpa.features.scalr import SOURCES, ScaLR, WaffleIronS, WaffleIronS2, feature_source
+from r3dpa.features.scalr import ScaLR, WaffleIronS, WaffleIronS2, feature_source
 from r3dpa.features.voxels import (
     Masking,
     PointCloudBatch,

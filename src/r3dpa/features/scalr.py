@@ -17,6 +17,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from r3dpa.feature_names import SOURCES
 from r3dpa.features.geometric import GeometricFeatures, random_basis
 from r3dpa.features.official import (
     FrozenNetwork,
@@ -34,9 +35,6 @@ from r3dpa.features.voxels import (
 )
 from r3dpa.features.waffleiron import WaffleIron
 from r3dpa.io import UNPICKLING_ERRORS, atomic_path, first_line, weights_sha256
-
-#: Names that :func:`feature_source` accepts.
-SOURCES = ("scalr", "waffleiron-s", "waffleiron-s-2", "geometric")
 
 _RELEASED = "ckpt_last.pth of WI_768-DINOv2_ViT_L_14-NS_KI_PD"
 # Entries with the weights in files of the distillation script and of its successor.

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-from r3dpa.feature_spaces import FREE_SPACES
+from r3dpa.feature_names import FREE_SPACES
 from r3dpa.io import source_commit
 from r3dpa.metrics.collection import (
     batches_with_features,

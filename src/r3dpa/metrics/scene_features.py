@@ -29,7 +29,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from r3dpa.feature_spaces import FREE_SPACES, SPACES
+from r3dpa.feature_names import FREE_SPACES, SPACES
 from r3dpa.features import GeometricFeatures, WaffleIronS
 from r3dpa.features.geometric import CENTRES
 from r3dpa.features.scalr import sha256
@@ -51,7 +51,7 @@ _INTENSITY = CENTRES[-1]
 class SceneFeatures:
     """A frozen network as a map from scenes to vectors."""
 
-    name: str  #: one of :data:`r3dpa.feature_spaces.SPACES`
+    name: str  #: one of :data:`r3dpa.feature_names.SPACES`
     dim: int  #: width F of the features
     card: dict[str, Any]  #: ``backbone``, ``layer``, ``weights`` (SHA-256), ``preprocessing``
     extract: Callable[[Sequence[EvaluationScene]], Tensor]  #: ``(B, F)``, of :func:`through_sensor`

@@ -1,0 +1,29 @@
+"""Names of feature sources and feature spaces, known before torch is imported.
+
+:mod:`r3dpa.features.scalr` makes the sources, :mod:`r3dpa.metrics.scene_features` describes the
+spaces.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+SOURCES = ("scalr", "waffleiron-s", "waffleiron-s-2", "geometric")
+"""Extractors of point features that the method aligns with."""
+
+FeatureSpace = Literal[
+    "frid",
+    "fld",
+    "fsvd",
+    "fpvd",
+    "fwid",
+    "fgeo",
+    "frd",
+    "frid_r2flow",
+    "frid_lidm",
+    "fpd",
+]
+SPACES: tuple[FeatureSpace, ...] = get_args(FeatureSpace)
+"""All spaces, in the order of tables."""
+FREE_SPACES: tuple[FeatureSpace, ...] = ("fwid", "fgeo")
+"""Spaces that need no weights from elsewhere."""
