@@ -211,6 +211,7 @@ def test_fit_help_starts_with_stages_and_presets(capsys):
     text = help_of("fit", capsys)
     assert text.startswith("usage: r3dpa fit STAGE [--preset NAME]")
     assert text.index("\n  joint ") < text.index("--trainer.max_steps")
+    assert "<class" not in text
 
 
 def test_common_names_of_options():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, is_dataclass
@@ -127,7 +128,7 @@ class Parser(ArgumentParser):
                 fields = ArgumentParser(add_help=False, formatter_class=HelpFormatter)
                 fields.add_class_arguments(kinds[0], action.dest)
                 texts.append(fields.format_help().partition("\n\n")[2])
-        return "\n".join(texts)
+        return re.sub(r"<class '([\w.]+)'>", r"\1", "\n".join(texts))
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         """Print the message and exit with status 2; parsers of nested classes raise it."""
