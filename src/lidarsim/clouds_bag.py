@@ -16,6 +16,7 @@ from lidarsim.clouds import PointCloud, suffix_of
 
 #: Suffixes of bags.
 BAGS = (".bag", ".db3", ".mcap")
+_METADATA = "metadata.yaml"  # beside the files of a ROS 2 recording
 _TYPE = "sensor_msgs/msg/PointCloud2"
 # Numbers of sensor_msgs/PointField.
 _DTYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
@@ -23,7 +24,8 @@ _DTYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8
 
 def is_bag(path: Path) -> bool:
     """Whether a file, or the folder of a ROS 2 recording, holds messages."""
-    return suffix_of(path) in BAGS or (path / "metadata.yaml").is_file()
+    is_file = path.is_file() and suffix_of(path) in BAGS
+    return is_file or (path / _METADATA).is_file()
 
 
 def read_bag(path: Path, topic: str | None = None) -> Iterator[tuple[str, PointCloud]]:
@@ -42,6 +44,8 @@ def read_bag(path: Path, topic: str | None = None) -> Iterator[tuple[str, PointC
     except ImportError as error:
         raise ScanError(f"{path}: bags need rosbags: pip install 'r3dpa[bag]'") from error
     source = path.parent if path.suffix == ".db3" else path
+    if path.suffix == ".db3" and not (source / _METADATA).is_file():
+        raise ScanError(f"{path}: needs {_METADATA} beside it, which `ros2 bag reindex` writes")
     try:
         with AnyReader([source], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             known = sorted({c.topic for c in reader.connections if c.msgtype == _TYPE})

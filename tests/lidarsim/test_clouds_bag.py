@@ -18,6 +18,7 @@ LAYOUT = np.dtype(
         "itemsize": 24,
     }
 )
+CLOUD = "sensor_msgs/msg/PointCloud2"
 KINDS = {"x": 7, "y": 7, "z": 7, "intensity": 7, "ring": 4}  # numbers of the message
 
 
@@ -31,83 +32,100 @@ def scan(seed, num_points=64):
     return table
 
 
-@pytest.fixture
-def write_mcap(tmp_path):
-    """``write_mcap({topic: [table, ...]})``: folder of a recording of these scans."""
-    rosbag2 = pytest.importorskip("rosbags.rosbag2")
-    from rosbags.typesys import Stores, get_typestore
-
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    cloud_type, field_type, header_type, time_type = (
-        store.types[name]
-        for name in (
-            "sensor_msgs/msg/PointCloud2",
-            "sensor_msgs/msg/PointField",
-            "std_msgs/msg/Header",
-            "builtin_interfaces/msg/Time",
+def message(store, table):
+    """Message of a scan, in the types of one version of ROS."""
+    types, stamp_type = store.types, "builtin_interfaces/msg/Time"
+    header = {"stamp": types[stamp_type](sec=0, nanosec=0), "frame_id": "lidar"}
+    if "seq" in types["std_msgs/msg/Header"].__dataclass_fields__:  # ROS 1
+        header["seq"] = 0
+    fields = [
+        types["sensor_msgs/msg/PointField"](
+            name=name, offset=LAYOUT.fields[name][1], datatype=number, count=1
         )
+        for name, number in KINDS.items()
+    ]
+    return types[CLOUD](
+        header=types["std_msgs/msg/Header"](**header),
+        height=1,
+        width=len(table),
+        fields=fields,
+        is_bigendian=False,
+        point_step=table.dtype.itemsize,
+        row_step=table.nbytes,
+        data=np.frombuffer(table.tobytes(), np.uint8),
+        is_dense=False,
     )
 
-    def message(table):
-        fields = [
-            field_type(name=name, offset=LAYOUT.fields[name][1], datatype=number, count=1)
-            for name, number in KINDS.items()
-        ]
-        return cloud_type(
-            header=header_type(stamp=time_type(sec=0, nanosec=0), frame_id="lidar"),
-            height=1,
-            width=len(table),
-            fields=fields,
-            is_bigendian=False,
-            point_step=table.dtype.itemsize,
-            row_step=table.nbytes,
-            data=np.frombuffer(table.tobytes(), np.uint8),
-            is_dense=False,
-        )
 
-    def write(topics):
-        path = tmp_path / "drive"
-        kind = rosbag2.StoragePlugin.MCAP
-        with rosbag2.Writer(path, version=8, storage_plugin=kind) as writer:
-            for topic, tables in topics.items():
-                connection = writer.add_connection(topic, cloud_type.__msgtype__, typestore=store)
-                for number, table in enumerate(tables):
-                    data = store.serialize_cdr(message(table), cloud_type.__msgtype__)
-                    writer.write(connection, number, data)
-        return path
+def write_recording(folder, suffix, topics):
+    """Write scans as ``{topic: [table, ...]}``: a file of ROS 1, or a folder of ROS 2."""
+    typesys = pytest.importorskip("rosbags.typesys")
+    from rosbags import rosbag1, rosbag2
 
-    return write
+    if suffix == ".bag":
+        path = folder / "drive.bag"
+        store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC)
+        writer, serialize = rosbag1.Writer(path), store.serialize_ros1
+    else:
+        path = folder / "drive"
+        store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+        kind = {".mcap": "MCAP", ".db3": "SQLITE3"}[suffix]
+        plugin = rosbag2.StoragePlugin[kind]
+        writer = rosbag2.Writer(path, version=8, storage_plugin=plugin)
+        serialize = store.serialize_cdr
+    with writer:
+        for topic, tables in topics.items():
+            connection = writer.add_connection(topic, CLOUD, typestore=store)
+            for number, table in enumerate(tables):
+                writer.write(connection, number, serialize(message(store, table), CLOUD))
+    return path
 
 
-def test_scans_of_a_recording_become_files(write_mcap, tmp_path):
+@pytest.mark.parametrize("suffix", [".bag", ".db3", ".mcap"])
+def test_scans_of_a_recording_become_files(suffix, tmp_path):
     tables = [scan(0), scan(1)]
     tables[1]["x"][5] = np.nan  # no return
-    folder = write_mcap({"/points": tables})
-    for number, source in enumerate((folder, *folder.glob("*.mcap"))):
+    recording = write_recording(tmp_path, suffix, {"/points": tables})
+    for number, source in enumerate((recording, *recording.glob(f"*{suffix}"))):
         line = convert(source, tmp_path / f"scans{number}", to="npz")
         assert line.startswith("2 scans written")
         cloud = read_cloud(tmp_path / f"scans{number}" / "000001.npz")
         rest = np.delete(tables[1], 5)
-        np.testing.assert_array_equal(cloud.points[:, 1], rest["y"])
+        np.testing.assert_array_equal(cloud.points, np.stack([rest[axis] for axis in "xyz"], 1))
         np.testing.assert_array_equal(cloud.ring, rest["ring"])
         np.testing.assert_array_equal(cloud.intensity, rest["intensity"])
 
 
-def test_several_topics_are_listed(write_mcap):
-    folder = write_mcap({"/front": [scan(0)], "/top": [scan(1)]})
+@pytest.mark.parametrize("suffix", [".bag", ".db3"])
+def test_several_topics_are_listed(suffix, tmp_path):
+    recording = write_recording(tmp_path, suffix, {"/front": [scan(0)], "/top": [scan(1)]})
     with pytest.raises(ScanError, match="choose --topic from /front, /top"):
-        next(read_bag(folder))
+        next(read_bag(recording))
     with pytest.raises(ScanError, match="unknown topic '/side'; choose --topic from /front, /top"):
-        next(read_bag(folder, "/side"))
-    assert len(list(read_bag(folder, "/top"))) == 1
+        next(read_bag(recording, "/side"))
+    assert len(list(read_bag(recording, "/top"))) == 1
 
 
-def test_a_damaged_bag_is_named(tmp_path):
+@pytest.mark.parametrize("name", ["drive.bag", "drive.mcap", "metadata.yaml"])
+def test_a_damaged_bag_is_named(name, tmp_path):
     pytest.importorskip("rosbags")
-    path = tmp_path / "drive.mcap"
-    path.write_bytes(b"\x89MCAP0\r\nnothing")
-    with pytest.raises(ScanError, match=r"drive\.mcap: is damaged or no bag"):
+    path = tmp_path / name
+    path.write_bytes(b"nothing")
+    with pytest.raises(ScanError, match=r": is damaged or no bag"):
+        next(read_bag(path if path.suffix != ".yaml" else tmp_path))
+
+
+def test_a_database_without_its_metadata_is_named(tmp_path):
+    pytest.importorskip("rosbags")
+    path = tmp_path / "drive_0.db3"
+    path.write_bytes(b"SQLite format 3\0")
+    with pytest.raises(ScanError, match=r"drive_0\.db3: needs metadata\.yaml .*ros2 bag reindex"):
         next(read_bag(path))
+
+
+def test_a_missing_bag_is_named(tmp_path):
+    with pytest.raises(ScanError, match=r"none\.bag: is no folder and no file"):
+        convert(tmp_path / "none.bag", tmp_path / "scans", to="bin")
 
 
 def test_rows_of_an_image_may_be_padded():
