@@ -45,6 +45,8 @@ class TestSensors:
         text = capsys.readouterr().out
         assert re.search(r"beams +64 by the order +100%", text)
         assert re.search(r"columns +2083", text)
+        assert re.search(r"\d% of the points of 2 scans .* range image of 64 x 2083", text)
+        assert "note: a turn about z cannot be seen in a scan: x has to point forward" in text
         assert load_sensor(out).num_beams == 64
         with Image.open(tmp_path / "mine.png") as picture:
             assert picture.size[0] > 500

@@ -1,4 +1,5 @@
 import math
+import re
 from itertools import chain
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from r3dpa.data import (
 )
 from r3dpa.data.feature_grids import default_features_dir
 from r3dpa.data.scans import KITTI360_DRIVES
-from r3dpa.geometry import BeamProjection, LidarSensor, RangeCodec, SphericalProjection
+from r3dpa.geometry import BeamProjection, LidarSensor, RangeCodec, SphericalProjection, share_kept
 
 
 # 10 training scans and batches of 2: an epoch has 5 batches. Stops: within the first epoch, at its
@@ -55,6 +56,22 @@ def test_the_order_depends_on_the_seed(data, fit):
 def test_overfit_batches_takes_the_first_scans_again_and_again(data, fit):
     module = fit(data(), 4, overfit_batches=2)
     assert module.seen == [[0, 1], [2, 3], [0, 1], [2, 3]]
+
+
+def test_the_share_of_points_in_the_images_is_printed_once_before_training(data, caplog, fit):
+    with caplog.at_level("INFO"):
+        module = data(further_scans=data().scans)
+        fit(module, 2)
+    shares = re.findall(r"\S+% of the points of 1 scan within the range limits.*", caplog.text)
+    scan = module.val_set.scans[0].read(module.sensor)[:, :3]
+    share = share_kept(torch.from_numpy(scan), module.projection)
+    assert shares == [
+        f"{share:.1%} of the points of 1 scan within the range limits come back from the range "
+        "image of 8 x 32"
+    ]
+    caplog.clear()
+    module.setup("predict")
+    assert "range image" not in caplog.text
 
 
 def test_missing_grids_are_made_once_and_need_their_extractor(

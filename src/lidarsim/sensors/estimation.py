@@ -172,7 +172,10 @@ def estimate_sensor(scans: Sequence[Any] | str | Path) -> SensorEstimate:
         )
     if not beams.is_sure_height.all():
         num = np.count_nonzero(~beams.is_sure_height)
-        notes.append(f"{num} beams see one distance: their optical centres are interpolated")
+        notes.append(
+            f"{num} of {len(beams.is_sure_height)} beams see one distance: their optical centres "
+            "are interpolated"
+        )
 
     azimuth = np.arctan2(points.xyz[:, 1], points.xyz[:, 0])
     columns = fit_columns(points.beam, azimuth, distance_m, points.scan)
@@ -370,8 +373,8 @@ def _mount(read: Sequence[SensorScan], beams: BeamFit) -> tuple[Floats, Mount | 
     above_m = (shift_m if is_shifted else 0.0) - float(np.median(heights))
     if above_m <= 0:
         raise ValueError(
-            f"{read[0].name}: the ground lies {-above_m:.2f} m above the sensor: turn the points "
-            "so that z points up, x forward and y left"
+            f"{read[0].name}: the ground lies above the sensor: turn the points so that z points "
+            "up, x forward and y left"
         )
     pitch_deg, roll_deg = (float(np.degrees(np.arctan(slope))) for slope in slopes[:2])
     return height_m, Mount(above_m, pitch_deg, roll_deg, float(heights.std())), notes

@@ -11,6 +11,12 @@ from jsonargparse.typing import PositiveFloat, PositiveInt
 from r3dpa.cli.parser import check_file, check_folder
 from r3dpa.pretrained import DEFAULT_WEIGHTS, OBJECTS_SUFFIX, check_features
 
+_FRAME_NOTE = (
+    "a turn about z cannot be seen in a scan: x has to point forward; where y does, "
+    "points[:, [0, 1]] = points[:, [1, 0]] * [1, -1] turns the points"
+)
+_SCANS_TO_CHECK = 3  # of whose points the share in the image is printed
+
 
 def check(folder: Path, *, columns: tuple[str, ...] = ()) -> None:
     """List every bad scan and missing folder of a data set; exit with 1 if there is any.
@@ -208,18 +214,27 @@ def sensor(scans: Path, *, out: Path, num: PositiveInt = 30) -> str:
     check_file(out)
     if out.suffix not in (".yaml", ".yml"):
         raise ValueError(f"--out must be a .yaml file, got {out}")
-    from lidarsim.clouds import find_files
+    import numpy as np
+    import torch
+
+    from lidarsim.clouds import find_files, read_cloud
     from lidarsim.sensors import estimate
     from r3dpa import viz
     from r3dpa.data.scans import evenly
+    from r3dpa.geometry import BeamProjection, describe_share_kept
     from r3dpa.io import text_table
 
-    estimated = estimate(evenly(find_files(scans)[1], num))
+    files = evenly(find_files(scans)[1], num)
+    estimated = estimate(files)
     estimated.save(out)
     picture = viz.save(viz.beam_residuals(estimated), out.with_suffix(".png"))
     table = text_table(estimated.rows(), ["quantity", "value", "confidence"], "llr", "plain")
-    notes = [f"note: {note}" for note in estimated.notes]
-    return "\n".join([table, *notes, f"{out}", f"{picture}"])
+    notes = [f"note: {note}" for note in (*estimated.notes, _FRAME_NOTE)]
+    checked = evenly(files, _SCANS_TO_CHECK)
+    clouds = [read_cloud(file, drop_nan=True, with_labels=False) for file in checked]
+    points = [torch.from_numpy(cloud.points.astype(np.float32)) for cloud in clouds]
+    share = describe_share_kept(points, BeamProjection.of(estimated.sensor))
+    return "\n".join([table, *notes, share, f"{out}", f"{picture}"])
 
 
 def plan(

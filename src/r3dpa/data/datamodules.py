@@ -36,6 +36,7 @@ from r3dpa.geometry import (
     RingProjection,
     ScanGeometry,
     SphericalProjection,
+    describe_share_kept,
 )
 
 _SENSOR = LidarSensor()
@@ -44,6 +45,7 @@ _AUGMENTATION = Augmentation()
 _SCALR_DIM = 768  # width of the published feature grids
 _COLUMNS = 1024  # of the images of named sensors
 _SCANS_TO_FIT = 8  # scans that the ring inclinations are measured in
+_SCANS_TO_CHECK = 3  # of whose points the share in the image is printed
 _EMPTY_SPLIT = (
     "all scans are of the other split. Look at val_every and val_drives, or, in the KITTI-360 "
     "layout, for missing drives with `r3dpa data check`"
@@ -248,9 +250,17 @@ class LidarDataModule(LoaderModule):
         rank_zero_info(f"feature grids: {num_made} made, in {self.features_dir}")
 
     def setup(self, stage: str) -> None:
-        """Index the scans; open the store of feature grids, except to predict."""
+        """Index the scans; open the store of feature grids, except to predict.
+
+        Before training, the share of the points that the images hold is printed.
+        """
         train, val, self.projection = self._scans_and_projection()
         scans, grids = sorted(train + val), None
+        if stage == "fit" and scans and not self.makes_scans:
+            # Held-out scans are none of further_scans.
+            checked = evenly(val or train, _SCANS_TO_CHECK)
+            points = [self.points(scan)[:, :3] for scan in checked]
+            rank_zero_info(describe_share_kept(points, self.projection))
         if self.features_dir is not None and stage != "predict":
             extractor = cast(Extractor | None, self.extractor)
             grids = FeatureGrids(

@@ -9,6 +9,7 @@ Letters: B batch, P points, H beams, W columns, h x w cells, F feature width.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -207,6 +208,17 @@ def share_kept(points: Tensor, projection: Projection) -> float:
     inside = in_range(points, projection.sensor)
     range_m, _ = range_image(points, projection)
     return int((range_m > 0).sum()) / max(int(inside.sum()), 1)
+
+
+def describe_share_kept(scans: Sequence[Tensor], projection: Projection) -> str:
+    """Return the mean of :func:`share_kept` over scans ``(P, 3)``, in a line."""
+    share = sum(share_kept(points, projection) for points in scans) / len(scans)
+    size = f"{projection.sensor.beams} x {projection.sensor.columns}"
+    noun = "scan" if len(scans) == 1 else "scans"
+    return (
+        f"{share:.1%} of the points of {len(scans)} {noun} within the range limits come back from "
+        f"the range image of {size}"
+    )
 
 
 def points_of(
