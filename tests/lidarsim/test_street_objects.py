@@ -55,13 +55,6 @@ ONE = {
     "motorcycle": (vehicles.motorcycle, {Semantic.MOTORCYCLE}, (1.5, 0.65, 1.0), (2.2, 0.8, 1.1)),
     "bicycle": (vehicles.bicycle, {Semantic.BICYCLE}, (1.7, 0.5, 1.0), (1.85, 0.6, 1.05)),
     "person": (people.person, {Semantic.PERSON}, (0.25, 0.4, 1.55), (1.0, 0.9, 1.9)),
-    "child": (people.child, {Semantic.PERSON}, (0.15, 0.25, 1.0), (0.8, 0.6, 1.45)),
-    "pram": (
-        people.pram,
-        {Semantic.PERSON, Semantic.UNKNOWN_OBJECT},
-        (1.2, 0.4, 1.55),
-        (2.0, 0.8, 1.9),
-    ),
     "cyclist": (
         people.cyclist, {Semantic.RIDER, Semantic.BICYCLE}, (1.7, 0.5, 1.6), (1.85, 0.7, 2.0),
     ),

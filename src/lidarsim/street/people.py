@@ -29,26 +29,6 @@ def person(draw: Generator) -> Body:
     return (*_figure(draw, tall_m, draw.uniform(*_STRIDE)), *_luggage(draw, tall_m))
 
 
-def child(draw: Generator) -> Body:
-    """A walking child."""
-    return tuple(_figure(draw, draw.uniform(*_CHILD_M), draw.uniform(*_STRIDE)))
-
-
-def pram(draw: Generator) -> Body:
-    """An adult who pushes a pram: a basket under a hood, on four wheels."""
-    pusher = _figure(draw, draw.uniform(*_ADULT_M), draw.uniform(*_STRIDE))
-    look = (Semantic.UNKNOWN_OBJECT, Material.CLOTH, draw.uniform(0.08, 0.25))
-    wheels_m = (0.75, 0.5, 0.25)
-    return (
-        *(part._replace(centre=_shift_ahead(part.centre, -0.55)) for part in pusher),
-        Part((0.35, 0, 0.65), (0.8, 0.4, 0.3), *look),
-        Part((0.5, 0, 0.85), (0.45, 0.42, 0.5), *look, Shape.ELLIPSOID),
-        # Front and rear wheels: of a block of which a ray from the side meets only the ends.
-        Part((0.35, 0, 0.125), wheels_m, *look, slats=(0.5, 0.45)),
-        Part((-0.15, 0, 0.98), (0.06, 0.45, 0.06), *look, detail=True),
-    )
-
-
 def cyclist(draw: Generator) -> Body:
     """A rider on a bicycle, leaning to the handlebar, one foot down and one up."""
     tall_m = draw.uniform(*_ADULT_M)
@@ -134,7 +114,3 @@ def _luggage(draw: Generator, tall_m: float) -> list[Part]:
     if kind < 0.45:
         return [Part((-0.15 * tall_m, 0, 0.68 * tall_m), (0.2, 0.32, 0.45), *look, detail=True)]
     return []
-
-
-def _shift_ahead(at: tuple[float, float, float], ahead_m: float) -> tuple[float, float, float]:
-    return (at[0] + ahead_m, at[1], at[2])

@@ -12,14 +12,7 @@ from numpy.random import Generator
 
 from lidarsim.scene import Material, Semantic
 from lidarsim.street.builder import Builder, Strip
-from lidarsim.street.buildings import (
-    building,
-    carport,
-    garage,
-    hall,
-    row_houses,
-    shed,
-)
+from lidarsim.street.buildings import Front, building, carport, garage, hall, row_houses, shed
 from lidarsim.street.course import BLOCK_M
 from lidarsim.street.furniture import bicycles, bins, poster
 from lidarsim.street.gardens import border, fence, front_garden, hedge, shrub, verge
@@ -56,12 +49,14 @@ def _town(builder: Builder, draw: Generator, start: float, side: float, edge_m: 
         kind = draw.random()
         if kind < 0.5:
             front_m = edge_m + draw.uniform(0.0, 0.8)
-            building(builder, draw, (s, last), front_m, side, draw.uniform(8, 12), 12.0)
+            front = Front(side, s, last, front_m)
+            building(builder, draw, front, draw.uniform(8, 12), 12.0)
             if draw.random() < 0.06:
                 scaffolding(builder, draw, side, s, last, front_m, 6.0)
         elif kind < 0.85:
             front_m = edge_m + draw.uniform(2.0, 4.5)
-            building(builder, draw, (s, last), front_m, side, draw.uniform(8, 12), 10.0)
+            front = Front(side, s, last, front_m)
+            building(builder, draw, front, draw.uniform(8, 12), 10.0)
             border(builder, draw, side * (edge_m + 0.4), s, last)
             front_garden(builder, draw, Strip(side, s, last, edge_m + 0.8, front_m))
         else:
@@ -92,7 +87,8 @@ def _row_houses(
     """Row houses behind front gardens, each with its border and bins."""
     end = start + BLOCK_M
     setback_m = draw.uniform(2.5, 5.0)
-    row_houses(builder, draw, (start, end - draw.choice((0.0, 2.5))), edge_m + setback_m, side)
+    front = Front(side, start, end - draw.choice((0.0, 2.5)), edge_m + setback_m)
+    row_houses(builder, draw, front)
     for first, last in ((start, start + 8), (start + 8, start + 16), (start + 16, end)):
         if draw.random() < 0.75:
             border(builder, draw, side * (edge_m + 0.4), first, last - 1.3)
@@ -115,7 +111,7 @@ def _houses(builder: Builder, draw: Generator, start: float, side: float, edge_m
     setback_m, wide_m = draw.uniform(2.5, 6.5), draw.uniform(8, 14)
     first = draw.uniform(plot + 0.5, plot_end - wide_m - 0.5)
     front_m, size = edge_m + setback_m, (draw.uniform(8, 11), draw.uniform(4, 9))
-    building(builder, draw, (first, first + wide_m), front_m, side, *size)
+    building(builder, draw, Front(side, first, first + wide_m, front_m), *size)
     if draw.random() < 0.9:
         border(builder, draw, side * (edge_m + 0.4), plot, plot_end)
     front_garden(builder, draw, Strip(side, plot, plot_end, edge_m + 0.9, front_m))
@@ -168,7 +164,8 @@ def _blocks(builder: Builder, draw: Generator, start: float, side: float, edge_m
     """A block of flats on a lawn with shrubs and trees, bins and parked cars before it."""
     end, setback_m = start + BLOCK_M, draw.uniform(5.0, 9.0)
     front_m = edge_m + setback_m
-    building(builder, draw, (start, end - draw.choice((0.0, 8.0))), front_m, side, 11.0, 14.0)
+    front = Front(side, start, end - draw.choice((0.0, 8.0)), front_m)
+    building(builder, draw, front, 11.0, 14.0)
     front_garden(builder, draw, Strip(side, start, end, edge_m + 0.8, front_m - 0.5))
     if draw.random() < 0.5:
         hedge(builder, draw, side * (edge_m + 0.5), start, end - draw.uniform(2, 10))
@@ -216,7 +213,7 @@ def _yard(builder: Builder, draw: Generator, start: float, side: float, edge_m: 
     else:
         building_site(builder, draw, Strip(side, start, end, edge_m + 0.5, edge_m + 9.0))
     if draw.random() < 0.75:
-        hall(builder, draw, (start, end), edge_m + draw.uniform(10, 18), side)
+        hall(builder, draw, Front(side, start, end, edge_m + draw.uniform(10, 18)))
     else:
         _behind(builder, draw, start, side * (edge_m + 22), 0.85)
 
@@ -250,7 +247,8 @@ def _behind(builder: Builder, draw: Generator, start: float, lateral: float, woo
         wood_edge(builder, draw, s, lateral)
         return
     half_m, front_m = draw.uniform(5, 10), abs(lateral) - 4.5
-    building(builder, draw, (s - half_m, s + half_m), front_m, side, 9.0, draw.uniform(5, 12))
+    front = Front(side, s - half_m, s + half_m, front_m)
+    building(builder, draw, front, 9.0, draw.uniform(5, 12))
     for _ in range(5):
         at = side * (front_m - draw.uniform(1.0, 7))
         garden_tree(builder, draw, s + draw.uniform(-10, 10), at)
@@ -277,7 +275,8 @@ def build_side_street(builder: Builder, draw: Generator, side: float) -> None:
         for house in range(2):
             front_m = edge_m + 19.0 * house + (0.3 if town else draw.uniform(2.5, 6.0))
             depth_m = 18.5 if town else draw.uniform(9, 13)
-            building(builder, draw, (first, last), front_m, side, depth_m, draw.uniform(5, 12))
+            front = Front(side, first, last, front_m)
+            building(builder, draw, front, depth_m, draw.uniform(5, 12))
         if not town:
             border(builder, draw, side * (edge_m + 0.4), first, last)
     for corner in (-1.0, 1.0):
