@@ -68,39 +68,21 @@ __all__ = [
     "split_scans",
 ]
 
-_MODULES = {
-    "SIMULATOR_VERSION": "lidarsim.drives",
-    "TRAIN_DRIVES": "lidarsim.drives",
-    "VAL_DRIVES": "lidarsim.drives",
-    "EgoMotion": "lidarsim.scene",
-    "Instrument": "lidarsim.recorded",
-    "Lasers": "lidarsim.sensors",
-    "LidarSensor": "lidarsim.sensors",
-    "Material": "lidarsim.scene",
-    "Origin": "lidarsim.sweep",
-    "Pose": "lidarsim.scene",
-    "Primitive": "lidarsim.scene",
-    "Puddle": "lidarsim.scene",
-    "RecordedScan": "lidarsim.recorded",
-    "Scene": "lidarsim.scene",
-    "Semantic": "lidarsim.scene",
-    "Shape": "lidarsim.scene",
-    "SimulatedScan": "lidarsim.scan",
-    "Simulator": "lidarsim.scan",
-    "SpinningLidar": "lidarsim.sensors",
-    "Street": "lidarsim.street",
-    "Sweep": "lidarsim.sweep",
-    "Weather": "lidarsim.weather",
-    "WeatherPrior": "lidarsim.weather",
-    "WeatheredScan": "lidarsim.weather",
-    "drive_name": "lidarsim.drive_files",
-    "expected_scans": "lidarsim.drives",
-    "hdl64e": "lidarsim.sensors",
-    "load_sensor": "lidarsim.sensors",
-    "simulate": "lidarsim.drives",
-    "simulate_scan": "lidarsim.scan",
-    "split_scans": "lidarsim.drives",
-}
+_NAMES = {
+    "drive_files": ("drive_name",),
+    "drives": (
+        "SIMULATOR_VERSION", "TRAIN_DRIVES", "VAL_DRIVES", "expected_scans", "simulate",
+        "split_scans",
+    ),
+    "recorded": ("Instrument", "RecordedScan"),
+    "scan": ("SimulatedScan", "Simulator", "simulate_scan"),
+    "scene": ("EgoMotion", "Material", "Pose", "Primitive", "Puddle", "Scene", "Semantic", "Shape"),
+    "sensors": ("Lasers", "LidarSensor", "SpinningLidar", "hdl64e", "load_sensor"),
+    "street": ("Street",),
+    "sweep": ("Origin", "Sweep"),
+    "weather": ("Weather", "WeatherPrior", "WeatheredScan"),
+}  # fmt: skip
+_MODULES = {name: f"lidarsim.{module}" for module, names in _NAMES.items() for name in names}
 
 
 def __getattr__(name: str) -> Any:
