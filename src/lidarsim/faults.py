@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from lidarsim.draws import generator_for
-from lidarsim.recorded import RecordedScan, angles
+from lidarsim.recorded import RecordedScan
 from lidarsim.rings import rings_of
 from lidarsim.scan import EffectRecord
+from lidarsim.sensors.view import angles_of
 from lidarsim.weather import ADDED_CLASS, Seed, WeatheredScan, change_scan, kept_part
 
 Kind = Literal[
@@ -111,7 +112,8 @@ class Fault:
             stays = self._echoes(scan, generator)
         elif self.kind == "dropped_sectors":
             width, third = self.amount / 360 / _NUM_SECTORS, 1 / _NUM_SECTORS
-            turns = (angles(points)[1] / (2 * np.pi) + generator.random()) % 1
+            azimuth = angles_of(points)[1] % (2 * np.pi)
+            turns = (azimuth / (2 * np.pi) + generator.random()) % 1
             start = generator.uniform(0, third - width, _NUM_SECTORS)
             sector = (turns / third).astype(int) % _NUM_SECTORS
             stays = (turns - sector * third - start[sector]) % 1 >= width

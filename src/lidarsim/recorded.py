@@ -21,6 +21,7 @@ from lidarsim.scan import damped_intensity, power_of_intensity
 from lidarsim.scene import Material, Primitive, Scene
 from lidarsim.sensors.files import load_sensor
 from lidarsim.sensors.spinning import Lasers, SpinningLidar
+from lidarsim.sensors.view import angles_of
 from lidarsim.solids import GROUND, NO_SURFACE, Floats, Solids
 from lidarsim.sweep import Echoes, Sweep
 
@@ -104,12 +105,6 @@ class RecordedScan:
 
     def __len__(self) -> int:
         return len(self.points)
-
-
-def angles(points: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Inclination and azimuth in [0, 2 pi) of points ``(P, 3)``, each ``(P,)`` radians."""
-    x, y, z = points.T.astype(float)
-    return np.arctan2(z, np.hypot(x, y)), np.arctan2(y, x) % (2 * np.pi)
 
 
 @dataclass(frozen=True)
@@ -254,7 +249,7 @@ class RecordedSweep(Sweep):
             max_range_m=max(sensor.max_range_m, float(farthest)),
         )
         if scan.time_s is None:
-            turns = angles(self.points)[1] / (2 * np.pi)
+            turns = angles_of(self.points)[1] % (2 * np.pi) / (2 * np.pi)
             time_s = ((turns + 0.5) % 1.0 - 0.5) / sensor.spin_hz
         else:
             time_s = scan.time_s[self.rays_of].astype(float)

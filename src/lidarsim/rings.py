@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-from lidarsim.recorded import RecordedScan, angles
+from lidarsim.recorded import RecordedScan
 from lidarsim.ring_order import rings_in_order
-from lidarsim.sensors.view import LidarSensor
+from lidarsim.sensors.view import LidarSensor, angles_of
 
 How = Literal["stored", "order", "inclination"]
 _MOST_BEAMS = 256
@@ -58,7 +58,8 @@ def rings_of(scan: RecordedScan) -> Rings:
     Rings are numbered by their mean inclination. The number of shots follows from the median step
     of azimuth within the rings.
     """
-    inclination, azimuth = angles(scan.points)
+    inclination, azimuth = angles_of(scan.points)
+    azimuth %= 2 * np.pi
     if scan.ring is None:
         ring, how, sure = _in_order(inclination, azimuth) or _by_inclination(inclination)
     else:
