@@ -19,6 +19,7 @@ _STEP_M = 0.6  # between the plane of a sector and the one of the whole scan, be
 # The lowest points of what stands on the ground are not part of it: cells of this angle and length
 # with a point between these heights above the plane.
 _UPRIGHT_RAD, _UPRIGHT_M, _HEIGHTS_M = np.radians(0.7), 0.2, (0.25, 2.0)
+_AROUND_M, _FEWEST_AROUND = 25.0, 200
 Plane = NDArray[np.float64]  # slopes along x and y, and height at the origin
 
 
@@ -59,6 +60,15 @@ def ground_of(points: NDArray[np.float32]) -> tuple[NDArray[np.bool_], NDArray[n
     cell = (away_m / _UPRIGHT_M).astype(int) * 1000 + (azimuth / _UPRIGHT_RAD).astype(int)
     near &= ~np.isin(cell, cell[(above_m > _HEIGHTS_M[0]) & (above_m < _HEIGHTS_M[1])])
     return near, normal.astype(np.float32)
+
+
+def ground_around(points: NDArray[np.floating]) -> NDArray[np.float32] | None:
+    """Points ``(Q, 3)`` of the ground within 25 m; None if little ground is seen."""
+    near = points[np.hypot(points[:, 0], points[:, 1]) < _AROUND_M].astype(np.float32)
+    if len(near) < _FEWEST_AROUND:
+        return None
+    ground = near[ground_of(near)[0]]
+    return None if len(ground) < _FEWEST_AROUND else ground
 
 
 def _plane(points: NDArray[np.float32], lowest: NDArray[np.float32], known: Plane) -> Plane:

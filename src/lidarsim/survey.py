@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
@@ -9,12 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from lidarsim.clouds import PointCloud
-from lidarsim.ground import ground_of
+from lidarsim.ground import ground_around
 from lidarsim.rings import rings_of
 from lidarsim.weather import recorded_scan
 
 # The ground of a sensor on a car lies 1.2 to 3 m below it, in the frame of the vehicle near 0.
-_VEHICLE_FRAME_M, _NEAR_M, _FEWEST_GROUND_POINTS = 0.4, 25.0, 200
+_VEHICLE_FRAME_M = 0.4
 _KNOWN_BESIDE = (".label", ".origin", ".json", ".yaml", ".md")
 
 
@@ -24,24 +25,14 @@ def describe_scan(cloud: PointCloud) -> str:
     rings = rings_of(scan)
     beams = f"{rings.num_rings} beams by {rings.how}, {rings.sure:.0%} of the points sure"
     line = f"{cloud.where}: {cloud.describe()}, {beams}"
-    height_m = ground_height_m(scan.points)
-    if height_m is not None and abs(height_m) < _VEHICLE_FRAME_M:
+    ground = ground_around(scan.points)
+    height_m = math.inf if ground is None else float(np.median(ground[:, 2]))
+    if abs(height_m) < _VEHICLE_FRAME_M:
         line += (
             f"\nnote: {cloud.where}: its ground lies at z = {height_m:.2f} m, as in the frame of a "
             "vehicle: subtract the height of the sensor, which all commands take as the origin"
         )
     return line
-
-
-def ground_height_m(points: np.ndarray) -> float | None:
-    """Return the median z of the ground around the origin; None if little ground is seen."""
-    near = points[np.hypot(points[:, 0], points[:, 1]) < _NEAR_M]
-    if len(near) < _FEWEST_GROUND_POINTS:
-        return None
-    is_ground, _ = ground_of(near)
-    if np.count_nonzero(is_ground) < _FEWEST_GROUND_POINTS:
-        return None
-    return float(np.median(near[is_ground, 2]))
 
 
 def skipped_files(files: Iterable[Path], used: Iterable[Path]) -> str | None:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarsim.clouds import find_files
-from lidarsim.ground import ground_of
+from lidarsim.ground import ground_around
 from lidarsim.sensors.beams import MORE_THAN_A_TURN, BeamFit, ColumnFit, fit_beams, fit_columns
 from lidarsim.sensors.files import SensorFile, write_sensor
 from lidarsim.sensors.recordings import (
@@ -40,7 +40,6 @@ _COHERENT = 0.5
 _DOUBLE_SHARE = 0.05
 _SECTOR_DEG, _WHOLE_TURN_DEG = 2, 350
 _FEW_POINTS = 0.02  # of the median of all degrees of azimuth: a blind sector has fewer
-_GROUND_M, _FEWEST_GROUND_POINTS = 25.0, 200
 _VEHICLE_HEIGHT_M = 0.5  # more above the origin: frame of a vehicle
 _QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 
@@ -276,7 +275,8 @@ def _disagreement(points: BeamPoints, beams: BeamFit, names: Sequence[str]) -> l
     for number in numbers:
         rows = np.flatnonzero(points.scan == number)
         order = rows[np.argsort(points.beam[rows], kind="stable")]
-        groups = np.split(beams.residual[order], np.cumsum(_counts(points.beam[rows], num_beams)))
+        counts = np.bincount(points.beam[rows], minlength=num_beams)
+        groups = np.split(beams.residual[order], np.cumsum(counts))
         median = np.array([np.median(group) if len(group) else 0.0 for group in groups[:num_beams]])
         typical = float(np.median(np.abs(median)))
         largest = max(largest, (typical, float(np.abs(median).max()), int(number)))
@@ -290,10 +290,6 @@ def _disagreement(points: BeamPoints, beams: BeamFit, names: Sequence[str]) -> l
         f"beams of single scans lie within {np.degrees(most):.4f} degrees of the beams of all "
         f"{len(numbers)} (largest in {names[number]})"
     ]
-
-
-def _counts(beam: Indices, num_beams: int) -> Indices:
-    return np.bincount(beam, minlength=num_beams)
 
 
 def _rotation(
@@ -355,7 +351,8 @@ def _mount(read: Sequence[SensorScan], beams: BeamFit) -> tuple[Floats, Mount | 
     notes, height_m = [], beams.height_m
     shift_m = float(np.median(height_m))
     is_shifted = abs(shift_m) > _VEHICLE_HEIGHT_M
-    planes = [plane for scan in read if (plane := _ground_plane(scan)) is not None]
+    grounds = [ground_around(scan.cloud.points) for scan in read]
+    planes = [_plane_of(ground) for ground in grounds if ground is not None]
     if is_shifted:
         notes.append(
             f"the beams start {shift_m:.2f} m above the origin, as in the frame of a vehicle: "
@@ -380,17 +377,10 @@ def _mount(read: Sequence[SensorScan], beams: BeamFit) -> tuple[Floats, Mount | 
     return height_m, Mount(above_m, pitch_deg, roll_deg, float(heights.std())), notes
 
 
-def _ground_plane(scan: SensorScan) -> Floats | None:
-    """Slopes along x and y, and height at the origin, of the ground; None if little is seen."""
-    points = scan.cloud.points
-    near = points[np.hypot(points[:, 0], points[:, 1]) < _GROUND_M].astype(np.float32)
-    if len(near) < _FEWEST_GROUND_POINTS:
-        return None
-    ground = near[ground_of(near)[0]].astype(float)
-    if len(ground) < _FEWEST_GROUND_POINTS:
-        return None
-    design = np.column_stack([ground[:, :2], np.ones(len(ground))])
-    return np.linalg.lstsq(design, ground[:, 2], rcond=None)[0]
+def _plane_of(ground: NDArray[np.float32]) -> Floats:
+    """Slopes along x and y, and height at the origin, of points ``(P, 3)`` of the ground."""
+    design = np.column_stack([ground[:, :2].astype(float), np.ones(len(ground))])
+    return np.linalg.lstsq(design, ground[:, 2].astype(float), rcond=None)[0]
 
 
 def _lasers(beams: BeamFit, columns: ColumnFit, offset: Floats, height_m: Floats) -> Lasers:
