@@ -6,7 +6,6 @@ import math
 import random
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
@@ -172,7 +171,7 @@ class Weather(scene.Conditions):
         boxes: NDArray[np.floating] | None,
         effects: Mapping[str, str | bool] | None,
     ) -> WeatheredScan:
-        off, wanted, idle = _switched(tuple((effects or {}).items()))
+        off, wanted, idle = _switched(effects or {})
         vehicles = _vehicles(boxes)
         if self.traffic_m_s and self.water_film_mm and scan.labels is not None:
             vehicles += _labelled_vehicles(scan, self.traffic_m_s)
@@ -182,8 +181,7 @@ class Weather(scene.Conditions):
         sensor = instrument.sensor_for(scan)
         called = {effect_name(effect) for effect in wanted if effect.called_by(world, sensor)}
         if not called - off.keys() - _DETECTION:
-            every = _numbers(1 << len(scan).bit_length())[: len(scan)]
-            return kept_part(scan, every, idle)
+            return kept_part(scan, np.arange(len(scan)), idle)
         key = seed if isinstance(seed, tuple) else (seed,)
         sweep = RecordedSweep(world, scan, instrument, sensor, Draws(len(scan), *key, "power"))
         records = tuple(run_effect(effect, sweep, key, off) for effect in wanted)
@@ -224,13 +222,12 @@ def change_scan(scan: Any, change: Callable[[RecordedScan], WeatheredScan]) -> A
     return scan.new_tensor(points) if is_tensor else points
 
 
-@cache
 def _switched(
-    effects: tuple[tuple[str, str | bool], ...],
+    effects: Mapping[str, str | bool],
 ) -> tuple[dict[str, str], list[Effect], tuple[EffectRecord, ...]]:
     """Effects that are off, those that may run, and the records where none is called."""
-    off = check_switches(dict(effects))
-    on = {name for name, switch in effects if switch in ("on", True)}
+    off = check_switches(effects)
+    on = {name for name, switch in effects.items() if switch in ("on", True)}
     for name in REFUSED.keys() & on:
         raise ValueError(f"effect {name} cannot act on a recorded scan: {REFUSED[name]}")
     left_out = {*REFUSED, *_ON_REQUEST} - on
@@ -256,14 +253,6 @@ def kept_part(
     return WeatheredScan(
         index=kept, shot=kept, origins=nothing, effects=records, report=report, **columns
     )
-
-
-@cache
-def _numbers(num: int) -> NDArray[np.int64]:
-    """0, 1, 2, ...: kept, since it would be most of the cost of clear weather."""
-    numbers = np.arange(num)
-    numbers.flags.writeable = False
-    return numbers
 
 
 def _result(
