@@ -150,14 +150,12 @@ def simulate(
     }
     if every > 1:
         request["every"] = every
-    holds_more = _check_folder(out, request)
     files = {DriveFiles(out, drive): count for drive, count in counts.items()}
+    holds_more = _check_folder(out, request)
     read_only = out.is_dir() and not os.access(out, os.W_OK)
     if (read_only or holds_more) and not any(d.missing(count) for d, count in files.items()):
-        return _report_of(files, 0)
+        return make_report(_summaries(files), 0)
     out.mkdir(parents=True, exist_ok=True)
-    from tqdm import tqdm  # simulated scans that are not written do not need it
-
     with only_writer(out / ".lock", f"simulates into {out}", wait=True):
         # Again, since another process may have written meanwhile.
         holds_more = _check_folder(out, request)
@@ -165,22 +163,33 @@ def simulate(
             write(out / _MANIFEST, to_json(request))
         classes = "".join(f"{int(semantic)}: {semantic.name.lower()}\n" for semantic in Semantic)
         write(out / _CLASSES, classes.encode())
-        tasks = []
-        for drive, count in files.items():
-            missing = drive.missing(count)
-            simulator = simulators[drive.drive]
-            for start in range(0, len(missing), _SCANS_PER_TASK):
-                numbers = missing[start : start + _SCANS_PER_TASK]
-                tasks.append((drive, simulator, numbers, every))
-        num_missing = sum(len(numbers) for _, _, numbers, _ in tasks)
-        complete = scans - num_missing
-        # disable=None: no bar without a terminal.
-        with tqdm(total=scans, initial=complete, unit="scan", desc="simulate", disable=None) as bar:
-            for num_written in in_processes(_run, tasks, workers):
-                bar.update(num_written)
+        num_written = _write_missing(files, simulators, every, workers)
         if holds_more:  # whose poses and report cover all scans
-            return _report_of(files, num_missing)
-        return _finish(out, files, num_missing)
+            return make_report(_summaries(files), num_written)
+        return _finish(out, files, num_written)
+
+
+def _write_missing(
+    files: Mapping[DriveFiles, int], simulators: Mapping[str, Simulator], every: int, workers: int
+) -> int:
+    """Simulate the scans that are not there yet, and return their number."""
+    from tqdm import tqdm  # simulated scans that are not written do not need it
+
+    tasks: list[_Task] = []
+    for drive, count in files.items():
+        missing = drive.missing(count)
+        for start in range(0, len(missing), _SCANS_PER_TASK):
+            numbers = missing[start : start + _SCANS_PER_TASK]
+            tasks.append((drive, simulators[drive.drive], numbers, every))
+    num_missing = sum(len(numbers) for _, _, numbers, _ in tasks)
+    total = sum(files.values())
+    # disable=None: no bar without a terminal.
+    with tqdm(
+        total=total, initial=total - num_missing, unit="scan", desc="simulate", disable=None
+    ) as bar:
+        for num_written in in_processes(_run, tasks, workers):
+            bar.update(num_written)
+    return num_missing
 
 
 def split_scans(scans: int, drives: Sequence[str]) -> dict[str, int]:
@@ -285,9 +294,8 @@ def _finish(out: Path, files: Mapping[DriveFiles, int], num_written: int) -> Sim
     return report
 
 
-def _report_of(files: Mapping[DriveFiles, int], num_written: int) -> SimulationReport:
-    summaries = [summary for drive, count in files.items() for summary in drive.summaries(count)]
-    return make_report(summaries, num_written)
+def _summaries(files: Mapping[DriveFiles, int]) -> list[dict[str, Any]]:
+    return [summary for drive, count in files.items() for summary in drive.summaries(count)]
 
 
 def make_report(summaries: Sequence[Mapping[str, Any]], num_written: int) -> SimulationReport:
