@@ -8,7 +8,7 @@ from pathlib import Path
 
 from lidarsim.cloud_formats import ScanError
 from lidarsim.clouds import PointCloud, label_path_of, packed
-from lidarsim.io import atomic_path
+from lidarsim.io import write_bytes
 
 
 def write_below(cloud: PointCloud, root: Path, out: Path) -> dict[str, int]:
@@ -34,8 +34,7 @@ def write_below(cloud: PointCloud, root: Path, out: Path) -> dict[str, int]:
     contents[path] = packed(path, cloud)
     for written, content in contents.items():
         refuse_outside(written, out)
-        with atomic_path(written) as temporary:
-            temporary.write_bytes(content)
+        write_bytes(written, content)
     return {written.relative_to(out).as_posix(): len(data) for written, data in contents.items()}
 
 

@@ -41,7 +41,7 @@ from lidarsim.cloud_formats import (
     read_bytes,
     table_of,
 )
-from lidarsim.io import UNPICKLING_ERRORS, atomic_path, first_line
+from lidarsim.io import UNPICKLING_ERRORS, first_line, write_bytes
 
 _NAMES = {
     **{axis: axis for axis in "xyz"},
@@ -330,9 +330,7 @@ def write_cloud(path: str | Path, cloud: PointCloud, full_scale: float | None = 
     Raises:
         ScanError: If the format cannot be written, or cannot hold the cloud.
     """
-    content = packed(Path(path), cloud, full_scale)
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(content)
+    write_bytes(path, packed(Path(path), cloud, full_scale))
 
 
 def packed(path: Path, cloud: PointCloud, full_scale: float | None = None) -> bytes:

@@ -9,7 +9,7 @@ from typing import Literal
 from lidarsim.cloud_formats import ScanError
 from lidarsim.clouds import WRITERS, PointCloud, find_files, read_cloud, suffix_of
 from lidarsim.clouds_bag import is_bag, read_bag
-from lidarsim.io import atomic_path
+from lidarsim.io import write_bytes
 from lidarsim.rings import rings_of
 from lidarsim.weather import recorded_scan
 
@@ -50,44 +50,41 @@ def convert(
         choices = ", ".join(name.removeprefix(".") for name in WRITERS)
         raise ValueError(f"{out}: unknown format {suffix!r}; choose --to from {choices}")
     if is_bag(source):
-        return _convert_bag(source, out, suffix, topic, full_intensity)
+        scans = ((out / f"{name}{suffix}", cloud) for name, cloud in read_bag(source, topic))
+    else:
+        targets = _targets(source, out, suffix)
+        scans = ((file, read_cloud(path, columns, drop_nan)) for file, path in targets.items())
+    num_written = 0
+    for target, cloud in scans:
+        _refuse_existing(target)
+        content = _content(cloud, suffix, full_intensity)
+        if cloud.labels is not None:
+            labels = cloud.labels.astype("<u4").tobytes()
+            write_bytes(target.with_name(f"{_stem(target)}.label"), labels)
+        write_bytes(target, content)
+        num_written += 1
+    return f"{num_written} scans written to {out} as {suffix}"
+
+
+def _targets(source: Path, out: Path, suffix: str) -> dict[Path, Path]:
+    """Scans of a file or folder, by the files to write."""
     root, files = find_files(source)
-    is_file = source.is_file() and suffix_of(out) == suffix
+    if source.is_file() and suffix_of(out) == suffix:
+        return {out: source}
     targets: dict[Path, Path] = {}
     for path in files:
         name = path.relative_to(root)
-        target = out if is_file else out / name.with_name(_stem(name) + suffix)
+        target = out / name.with_name(_stem(name) + suffix)
         if target in targets:
             raise ScanError(f"{path}: would be written as {target}, as would {targets[target]}")
-        if target.exists():
-            raise ScanError(f"{target}: exists: delete it, or give another folder")
+        _refuse_existing(target)
         targets[target] = path
-    for target, path in targets.items():
-        cloud = read_cloud(path, columns, drop_nan)
-        contents = {target: _content(cloud, suffix, full_intensity)}
-        if cloud.labels is not None:
-            labels = target.with_name(f"{_stem(target)}.label")
-            contents[labels] = cloud.labels.astype("<u4").tobytes()
-        for written, content in contents.items():
-            with atomic_path(written) as temporary:
-                temporary.write_bytes(content)
-    return f"{len(targets)} scans written to {out} as {suffix}"
+    return targets
 
 
-def _convert_bag(
-    source: Path, out: Path, suffix: str, topic: str | None, full_intensity: float | None
-) -> str:
-    """Write the scans of a bag, numbered in the order of recording, into a folder."""
-    num_written = 0
-    for name, cloud in read_bag(source, topic):
-        target = out / f"{name}{suffix}"
-        if target.exists():
-            raise ScanError(f"{target}: exists: delete it, or give another folder")
-        content = _content(cloud, suffix, full_intensity)
-        with atomic_path(target) as temporary:
-            temporary.write_bytes(content)
-        num_written += 1
-    return f"{num_written} scans written to {out} as {suffix}"
+def _refuse_existing(target: Path) -> None:
+    if target.exists():
+        raise ScanError(f"{target}: exists: delete it, or give another folder")
 
 
 def _content(cloud: PointCloud, suffix: str, full_intensity: float | None) -> bytes:

@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarsim.boxes import kitti_label
-from lidarsim.io import atomic_path, delete_unfinished
+from lidarsim.io import delete_unfinished, write_bytes
 from lidarsim.scan import SimulatedScan
 from lidarsim.scene import Conditions, Pose
 
@@ -170,10 +170,8 @@ def to_json(values: Any) -> bytes:
 
 def write(path: Path, content: bytes) -> None:
     """Write a file atomically, unless it already holds these bytes."""
-    if path.is_file() and path.read_bytes() == content:
-        return
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(content)
+    if not path.is_file() or path.read_bytes() != content:
+        write_bytes(path, content)
 
 
 def _stem(number: int) -> str:

@@ -63,10 +63,15 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         raise OSError(number, os.strerror(number), str(path)) from error
 
 
+def write_bytes(path: str | Path, content: bytes) -> None:
+    """Write a file atomically."""
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content)
+
+
 def write_text(path: str | Path, text: str) -> None:
     """Write a text file atomically."""
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_bytes(path, text.encode())
 
 
 def sha256_of(path: Path) -> str:

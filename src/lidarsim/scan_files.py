@@ -20,7 +20,7 @@ from lidarsim.cloud_formats import (
     read_bytes,
 )
 from lidarsim.clouds import PointCloud, read_cloud, suffix_of
-from lidarsim.io import atomic_path
+from lidarsim.io import atomic_path, write_bytes
 from lidarsim.sensors.view import LidarSensor, in_range
 
 _KITTI = np.dtype([(name, "<f4") for name in ROWS[:4]])
@@ -129,8 +129,7 @@ def write_bin(path: str | Path, points: ArrayLike) -> None:
     rows = _rows(points)
     if rows.shape[1] == 3:
         rows = np.concatenate([rows, np.zeros((len(rows), 1), np.float32)], axis=1)
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(rows.astype("<f4").tobytes())
+    write_bytes(path, rows.astype("<f4").tobytes())
 
 
 def write_ply(path: str | Path, points: ArrayLike) -> None:
@@ -138,9 +137,7 @@ def write_ply(path: str | Path, points: ArrayLike) -> None:
 
     Atomic; ``ValueError`` for another shape, NaN or infinite values.
     """
-    table = PointCloud.of(_rows(points)).table
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(ply_of(table))
+    write_bytes(path, ply_of(PointCloud.of(_rows(points)).table))
 
 
 def write_npz(path: str | Path, scans: Iterable[tuple[str, ArrayLike]]) -> None:

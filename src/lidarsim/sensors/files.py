@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lidarsim.io import atomic_path
+from lidarsim.io import write_text
 from lidarsim.sensors.spinning import Lasers, SpinningLidar
 
 _FOLDER = Path(__file__).parent / "presets"
@@ -102,8 +102,7 @@ def write_sensor(
     if estimate is not None:
         document["estimate"] = dict(estimate)
     text = yaml.safe_dump(document, default_flow_style=None, sort_keys=False, width=100)
-    with atomic_path(path) as temporary:
-        temporary.write_text(text)
+    write_text(path, text)
 
 
 def _columns_of(lasers: Lasers) -> dict[str, list[float]]:
