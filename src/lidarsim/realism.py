@@ -70,6 +70,16 @@ def measures(s: ScanStatistics) -> dict[str, Measure]:
 
 
 def _measures(s: ScanStatistics) -> Iterator[Measure]:
+    yield from _returns(s)
+    yield from _losses(s)
+    yield from _beams(s)
+    yield from _intensities(s)
+    yield from _ground(s)
+    yield from _neighbours_and_places(s)
+
+
+def _returns(s: ScanStatistics) -> Iterator[Measure]:
+    """Number of returns, share of the image, and ranges."""
     row_shares = _ratio(s.row_returns, s.num_scans * SENSOR.columns)
     mean_returns = _ratio(s.num_returns, s.num_scans)
     hit_rows = (row_shares > _HIT_ROW_SHARE).sum()
@@ -83,6 +93,9 @@ def _measures(s: ScanStatistics) -> Iterator[Measure]:
         yield _w1(f"range W1{block}", "m", "points", s, "range_counts", histogram=ranges)
         yield _jsd(f"range JSD{block}", "points", ranges)
 
+
+def _losses(s: ScanStatistics) -> Iterator[Measure]:
+    """Shots without a return."""
     dropout = (1 - _ratio(s.beam_returns, s.shots)).clip(0)  # no return between 1 and 80 m
     yield Measure("dropout by beam", "1", "beams", curve_rmse, dropout, dropout.mean())
     yield _w1("dropout run length", "shots", "rings", s, "drop_runs")
@@ -92,6 +105,9 @@ def _measures(s: ScanStatistics) -> Iterator[Measure]:
     yield _keep_rate("incidence, ground", "rings ground", s.keep_by_incidence[0])
     yield _keep_rate("incidence, upright", "rings", s.keep_by_incidence[1])
 
+
+def _beams(s: ScanStatistics) -> Iterator[Measure]:
+    """Noise and bias of each beam."""
     # Around the neighbours in the ring. From the median of the absolute residuals, as for a normal
     # variable, so that the few returns of grass and foliage that pass for smooth do not count more.
     noise_mm = _quantile(s.residual_counts, 0.5) * BINS["residual_counts"].width * 1000
@@ -104,6 +120,8 @@ def _measures(s: ScanStatistics) -> Iterator[Measure]:
     yield Measure("range bias by beam", "mm", "beams", curve_rmse, bias_mm)
     yield _number("spread of the beams' bias", "mm", "beams", _over_finite(np.std, bias_mm))
 
+
+def _intensities(s: ScanStatistics) -> Iterator[Measure]:
     intensities = s.intensity_by_range.sum(axis=0)
     saturated = intensities[-2:].sum()  # 0.99 is the largest intensity in KITTI files
     yield _jsd("intensity JSD", "intensity", intensities)
@@ -112,6 +130,8 @@ def _measures(s: ScanStatistics) -> Iterator[Measure]:
     yield _intensity("incidence, upright", "intensity rings", s.intensity_by_incidence[1])
     yield _number("saturated share", "1", "intensity", _ratio(saturated, intensities.sum()))
 
+
+def _ground(s: ScanStatistics) -> Iterator[Measure]:
     yield _number("share below z = -1.4 m", "1", "points", _ratio(s.low_points, s.num_returns))
     heights = BINS["ground_residual_counts"]
     shares = _ratio(s.ground_residual_counts, s.ground_residual_counts.sum())
@@ -129,6 +149,9 @@ def _measures(s: ScanStatistics) -> Iterator[Measure]:
     median_m = _over_finite(np.median, spacing_m)
     yield Measure("ground ring spacing", "m", "beams ground", curve_rmse, spacing_m, median_m)
 
+
+def _neighbours_and_places(s: ScanStatistics) -> Iterator[Measure]:
+    """Edges along the rings, and where returns lie seen from above."""
     pairs, mixed, jumps = s.neighbours
     cells = len(s.bev_counts) // 2
     coarse = s.bev_counts.reshape(cells, 2, cells, 2).sum(axis=(1, 3))

@@ -157,20 +157,18 @@ def fit_columns(beam: Indices, azimuth: Floats, distance_m: Floats, scan: Indice
     residual = (straight - offset[beam] + column_rad / 2) % column_rad - column_rad / 2
 
     shots = (straight[after] - straight[before]) / column_rad
-    missing = np.rint(shots[is_level]).astype(np.int64) - 1
-    num_dropped = int(missing[(missing > 0) & (missing <= _MOST_DROPPED)].sum())
-    num_level = np.count_nonzero(is_level)
-    doubles = np.count_nonzero(np.abs(shots) < _DOUBLE_STEP)
+    dropped_share = _dropped_share(shots[is_level])
+    double_share = float((np.abs(shots) < _DOUBLE_STEP).sum() / len(azimuth))
     return ColumnFit(
-        columns,
-        coherence,
-        lateral_m,
-        offset,
-        residual,
-        num_dropped / (num_dropped + int(num_level)),
-        int(doubles) / len(azimuth),
-        turns,
+        columns, coherence, lateral_m, offset, residual, dropped_share, double_share, turns
     )
+
+
+def _dropped_share(shots: Floats) -> float:
+    """Share of dropped shots by the steps between neighbours on surfaces, in columns."""
+    missing = np.rint(shots).astype(np.int64) - 1
+    num_dropped = int(missing[(missing > 0) & (missing <= _MOST_DROPPED)].sum())
+    return num_dropped / (num_dropped + len(shots))
 
 
 def _turns(beam: Indices, azimuth: Floats, scan: Indices) -> float:

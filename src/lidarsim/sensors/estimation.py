@@ -156,47 +156,24 @@ def estimate_sensor(scans: Sequence[Any] | str | Path) -> SensorEstimate:
         raise ValueError("no scans given")
     read = [read_scan_of(scan, number) for number, scan in enumerate(scans)]
     points, notes = combine(read)
-    names = [scan.name for scan in read]
-
     distance_m = np.hypot(points.xyz[:, 0], points.xyz[:, 1])
     beams = fit_beams(points.beam, distance_m, points.xyz[:, 2])
     points, beams = _highest_first(points, beams)
     near_share = _check_spinning(points, beams)
-    notes += _disagreement(points, beams, names)
-    smear_deg = float(np.degrees(np.median(np.abs(beams.residual))))
-    if smear_deg > _SMEAR_DEG:
-        notes.append(
-            f"points lie {smear_deg:.3f} degrees (median) off their beams, as in scans compensated "
-            "for motion: raw scans give better angles and centres"
-        )
-    if not beams.is_sure_height.all():
-        num = np.count_nonzero(~beams.is_sure_height)
-        notes.append(
-            f"{num} of {len(beams.is_sure_height)} beams see one distance: their optical centres "
-            "are interpolated"
-        )
+    notes += _disagreement(points, beams, [scan.name for scan in read])
+    notes += _notes_on_beams(beams)
 
     azimuth = np.arctan2(points.xyz[:, 1], points.xyz[:, 0])
     columns = fit_columns(points.beam, azimuth, distance_m, points.scan)
-    if columns.coherence < _COHERENT:
-        notes.append("azimuths lie on no common steps: the columns follow from the mean step")
-    if columns.turns > MORE_THAN_A_TURN:
-        notes.append(
-            f"a scan is {360 * columns.turns:.0f} degrees long: directions that it sees twice have "
-            "one pixel in an image"
-        )
     direction, head = _rotation(read, points, azimuth)
     num_columns, offset, sure_columns = columns.columns, columns.offset, columns.coherence
     if points.column is not None and head is not None:
         num_columns, sure_columns = int(read[0].num_columns or 0), 1.0
         turned = azimuth - columns.lateral_m[points.beam] / distance_m - head
         offset = _offsets(points, turned, 2 * math.pi / num_columns)
-
     sectors, covered_deg = _blind_sectors(azimuth)
-    if covered_deg < _WHOLE_TURN_DEG:
-        notes.append(f"the scans cover {covered_deg} of 360 degrees; columns are of a whole turn")
-    if is_dual := columns.double_share > _DOUBLE_SHARE:
-        notes.append(f"{columns.double_share:.0%} of the points are second returns of a shot")
+    notes += _notes_on_columns(columns, covered_deg)
+
     height_m, mount, mount_notes = _mount(read, beams)
     range_m = np.sqrt(np.square(points.xyz).sum(axis=1))
     settings: dict[str, Any] = {} if mount is None else {"mount_height_m": round(mount.height_m, 4)}
@@ -205,7 +182,7 @@ def estimate_sensor(scans: Sequence[Any] | str | Path) -> SensorEstimate:
         num_columns,
         min_range_m=math.floor(100 * range_m.min()) / 100,
         max_range_m=math.ceil(10 * range_m.max()) / 10,
-        return_mode="dual" if is_dual else "strongest",
+        return_mode="dual" if columns.double_share > _DOUBLE_SHARE else "strongest",
         **settings,
     )
     confidence = {
@@ -230,6 +207,41 @@ def estimate_sensor(scans: Sequence[Any] | str | Path) -> SensorEstimate:
         mount,
         tuple(notes + mount_notes),
     )
+
+
+def _notes_on_beams(beams: BeamFit) -> list[str]:
+    """What is odd about the lines of the beams."""
+    notes = []
+    smear_deg = float(np.degrees(np.median(np.abs(beams.residual))))
+    if smear_deg > _SMEAR_DEG:
+        notes.append(
+            f"points lie {smear_deg:.3f} degrees (median) off their beams, as in scans compensated "
+            "for motion: raw scans give better angles and centres"
+        )
+    if not beams.is_sure_height.all():
+        num = np.count_nonzero(~beams.is_sure_height)
+        notes.append(
+            f"{num} of {len(beams.is_sure_height)} beams see one distance: their optical centres "
+            "are interpolated"
+        )
+    return notes
+
+
+def _notes_on_columns(columns: ColumnFit, covered_deg: int) -> list[str]:
+    """What is odd about the azimuths, of which so many degrees hold points."""
+    notes = []
+    if columns.coherence < _COHERENT:
+        notes.append("azimuths lie on no common steps: the columns follow from the mean step")
+    if columns.turns > MORE_THAN_A_TURN:
+        notes.append(
+            f"a scan is {360 * columns.turns:.0f} degrees long: directions that it sees twice have "
+            "one pixel in an image"
+        )
+    if covered_deg < _WHOLE_TURN_DEG:
+        notes.append(f"the scans cover {covered_deg} of 360 degrees; columns are of a whole turn")
+    if columns.double_share > _DOUBLE_SHARE:
+        notes.append(f"{columns.double_share:.0%} of the points are second returns of a shot")
+    return notes
 
 
 def _highest_first(points: BeamPoints, beams: BeamFit) -> tuple[BeamPoints, BeamFit]:
