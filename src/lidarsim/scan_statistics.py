@@ -118,14 +118,18 @@ class ScanStatistics:
 
 
 _AXES = {table.name: table.metadata["axes"] for table in fields(ScanStatistics) if table.metadata}
-#: Bins of the last binned axis of each table.
+#: Bins of the last binned axis of each table, which replaces the ones before it.
 BINS: dict[str, Bins] = {
     name: axis for name, axes in _AXES.items() for axis in axes if isinstance(axis, Bins)
 }
 
 
 def scan_statistics(points: NDArray[np.float32]) -> ScanStatistics:
-    """Counts of one scan ``(P, 4)`` x, y, z (metres), intensity in [0, 1], in storage order."""
+    """Counts of one scan ``(P, 4)`` x, y, z (metres), intensity in [0, 1], in storage order.
+
+    Raises:
+        ValueError: If the points have another shape, or intensities lie outside of [0, 1].
+    """
     if points.ndim != 2 or points.shape[1] != 4:
         raise ValueError(f"points must be (P, 4) x, y, z, intensity, got shape {points.shape}")
     distance = np.linalg.norm(points[:, :3].astype(np.float64), axis=1)
@@ -183,7 +187,7 @@ def _count_cells(s: ScanStatistics, xyz: Floats) -> None:
     within = (np.hypot(x, y) < BEV_EXTENT_M) & occupied.reshape(x.shape)
     s.count("bev_counts", inside[:, 0], inside[:, 1])
     s.count("height_counts", top[occupied])
-    s.count("sector_cells", _turn(x[within], y[within]) * _SECTORS)
+    s.count("sector_cells", _turn_share(x[within], y[within]) * _SECTORS)
 
 
 def _count_ground(s: ScanStatistics, xyz: Floats, ground: Ground) -> None:
@@ -192,7 +196,7 @@ def _count_ground(s: ScanStatistics, xyz: Floats, ground: Ground) -> None:
     nearest, farthest = structure.GROUND_DISTANCES_M
     near = (distance > nearest) & (distance < farthest)
     s.count("ground_residual_counts", ground.height_m(xyz[near]))
-    sector = Bins(1.0, _REACH_SECTORS).of(_turn(xyz[:, 0], xyz[:, 1]) * _REACH_SECTORS)
+    sector = Bins(1.0, _REACH_SECTORS).of(_turn_share(xyz[:, 0], xyz[:, 1]) * _REACH_SECTORS)
     outwards = np.lexsort((-distance, sector))
     ends = np.searchsorted(sector[outwards], np.arange(_REACH_SECTORS + 1))
     enough = np.diff(ends) >= _REACH_RETURNS
@@ -214,20 +218,34 @@ def _count_rings(
     groups = (unbroken, unbroken & mixed, unbroken & (to_after > _JUMP_M))
     s.neighbours += [group.sum() for group in groups]
 
-    # Lost and kept shots alike are assigned to the surface of the returns on both sides.
-    left = np.concatenate([np.arange(len(range_m)), before])
-    right, outcome = np.tile(after, 2), np.repeat([0, 1], len(range_m))  # lost, kept
-    across = missing[before] + missing + 2
-    known = missing * (missing <= structure.MAX_GAP_SHOTS), across <= structure.MAX_GAP_SHOTS + 1
-    shots = np.concatenate([missing + 1, across])
-    weight = np.concatenate(known) * structure.level_enough(range_m[left], range_m[right], shots)
+    _count_kept_and_lost(s, range_m, sweep, incidence_deg)
+
+
+def _count_kept_and_lost(
+    s: ScanStatistics, range_m: Floats, sweep: RingReturns, incidence_deg: Floats
+) -> None:
+    """Count the shots that came back and those that did not, by range and incidence.
+
+    Both count for the surface between two returns: a lost shot between the ones beside its gap, a
+    kept one between the ones beside it.
+    """
+    before, after, missing = sweep.neighbour(-1), sweep.neighbour(1), sweep.missing
+    num_lost = np.where(missing <= structure.MAX_GAP_SHOTS, missing, 0)
+    shots_across = missing[before] + missing + 2
+    num_kept = (shots_across <= structure.MAX_GAP_SHOTS + 1).astype(np.int64)
+    left, right = np.concatenate([np.arange(len(range_m)), before]), np.concatenate([after, after])
+    outcome = np.repeat([0, 1], len(range_m))  # lost, kept
+    shots = np.concatenate([missing + 1, shots_across])
+    is_level = structure.level_enough(range_m[left], range_m[right], shots)
+    weight = np.concatenate([num_lost, num_kept]) * is_level
     middle_m = (range_m[left] + range_m[right]) / 2
     angle_deg = (incidence_deg[:, left] + incidence_deg[:, right]) / 2
     surface, pair = np.isfinite(angle_deg).nonzero()
-    weights: dict[str, Any] = {"weight": weight[pair]}
     s.count("keep_by_range", middle_m, outcome, weight=weight)
-    s.count("surface_keep_by_range", surface, middle_m[pair], outcome[pair], **weights)
-    s.count("keep_by_incidence", surface, angle_deg[surface, pair], outcome[pair], **weights)
+    s.count("surface_keep_by_range", surface, middle_m[pair], outcome[pair], weight=weight[pair])
+    s.count(
+        "keep_by_incidence", surface, angle_deg[surface, pair], outcome[pair], weight=weight[pair]
+    )
 
 
 def _count_beams(
@@ -248,6 +266,6 @@ def _count_beams(
     s.count("step_counts", ring[level], step_m[level])
 
 
-def _turn(x: Floats, y: Floats) -> Floats:
+def _turn_share(x: Floats, y: Floats) -> Floats:
     """Azimuth as a share of the turn, from 0 at -pi."""
     return (np.arctan2(y, x) + math.pi) / (2 * math.pi)

@@ -189,7 +189,7 @@ class EgoMotion:
 
 @dataclass(frozen=True)
 class Conditions:
-    """State of the air, the sky and the road.
+    """State of the air, the sky and the road; :class:`lidarsim.Weather` also acts on scans.
 
     Args:
         visibility_m: Meteorological optical range (MOR): where a beam keeps 5 % of its power; at
@@ -233,29 +233,25 @@ def draw_weather(generator: np.random.Generator) -> Conditions:
     Bad air is fog, rain or snow, a third each. Visibility and rates are log-uniform, the other
     values uniform. In rain the road is wet; a sun below the horizon is night.
     """
-    air, third, sky = generator.random(3)
+    air, kind, sky = generator.random(3)
     film_mm = generator.uniform(0.1, 1.5)
-    elevation_deg = generator.uniform(-18.0, 62.0)
-    azimuth_deg = generator.uniform(-180.0, 180.0)
+    sun = {
+        "sun_elevation_deg": generator.uniform(-18.0, 62.0),
+        "sun_azimuth_deg": generator.uniform(-180.0, 180.0),
+    }
     if air < _CLEAR_DRY:
-        return Conditions(math.inf, 0.0, 0.0, 0.0, sky < _CLEAR_SKY, elevation_deg, azimuth_deg)
-    visibility_m, rain_mm_h, snow_mm_h = math.inf, 0.0, 0.0
-    if air >= _CLEAR_DRY + _CLEAR_WET:
-        kind = int(3 * third)
-        if kind == 0:
-            visibility_m = _even_logarithm(generator, (30.0, 1000.0))
-            film_mm = 0.0
-        elif kind == 1:
-            rain_mm_h = _even_logarithm(generator, (1.0, 30.0))
-        else:
-            snow_mm_h = _even_logarithm(generator, (0.5, 3.0))
-            film_mm = 0.0
-    return Conditions(
-        visibility_m, rain_mm_h, snow_mm_h, film_mm, False, elevation_deg, azimuth_deg
-    )
+        return Conditions(clear_sky=bool(sky < _CLEAR_SKY), **sun)
+    if air < _CLEAR_DRY + _CLEAR_WET:
+        return Conditions(water_film_mm=film_mm, clear_sky=False, **sun)
+    if kind < 1 / 3:
+        return Conditions(_log_uniform(generator, (30.0, 1000.0)), clear_sky=False, **sun)
+    if kind < 2 / 3:
+        rain_mm_h = _log_uniform(generator, (1.0, 30.0))
+        return Conditions(rain_mm_h=rain_mm_h, water_film_mm=film_mm, clear_sky=False, **sun)
+    return Conditions(snow_mm_h=_log_uniform(generator, (0.5, 3.0)), clear_sky=False, **sun)
 
 
-def _even_logarithm(generator: np.random.Generator, interval: Interval) -> float:
+def _log_uniform(generator: np.random.Generator, interval: Interval) -> float:
     return math.exp(generator.uniform(*np.log(interval)))
 
 
@@ -283,7 +279,9 @@ class Scene:
 
     def __post_init__(self) -> None:
         if not 0 < self.ground_reflectivity <= 1:
-            raise ValueError(f"reflectivity must lie in (0, 1], got {self.ground_reflectivity}")
+            raise ValueError(
+                f"ground_reflectivity must lie in (0, 1], got {self.ground_reflectivity}"
+            )
         if not self.pose.z_m > self.ground_m:
             raise ValueError(
                 f"the sensor must be above the ground at {self.ground_m} m, got z_m={self.pose.z_m}"
