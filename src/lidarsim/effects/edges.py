@@ -17,11 +17,13 @@ from lidarsim.effects.surface import surface_power
 from lidarsim.raycast import normals, surface_distance
 from lidarsim.scene import Scene
 from lidarsim.sensors.spinning import SpinningLidar
-from lidarsim.solids import EGO_BODY, GROUND, Floats
+from lidarsim.solids import EGO_BODY, GROUND, NO_SURFACE, Floats
 from lidarsim.sweep import IS_GROUND, Echoes, Effect, Origin, Sweep
 
 Indices = NDArray[np.int64]
 Surfaces = NDArray[np.int32]
+# Number of the ray among those chosen, surface, and the ray that sees the surface; each ``(K,)``.
+_Layer = tuple[Indices, Surfaces, Indices]
 
 #: Ranges that differ by more make an edge.
 _EDGE_M = 0.3
@@ -113,17 +115,7 @@ class MixedPixels(Effect):
 
 def _targets_of(sweep: Sweep, rays: Indices) -> _Targets:
     """Own surfaces, neighbours' surfaces and thin solids that the rims of rays may meet."""
-    first, (num_beams, num_shots) = sweep.first, sweep.shape
-    every_row = np.arange(len(rays))
-    beam, shot = np.divmod(rays, num_shots)
-    beside = np.stack(
-        [
-            beam * num_shots + (shot + 1) % num_shots,
-            beam * num_shots + (shot - 1) % num_shots,
-            np.where(beam > 0, rays - num_shots, rays),
-            np.where(beam < num_beams - 1, rays + num_shots, rays),
-        ]
-    )
+    first, beside = sweep.first, _neighbours(rays, sweep.shape)
     solid, solid_m = first.surface[rays], first.range_m[rays]
     other, other_m = first.surface[beside], first.range_m[beside]
     # Only a solid that ends before something else is missed by the rim of the ray that meets it.
@@ -134,24 +126,11 @@ def _targets_of(sweep: Sweep, rays: Indices) -> _Targets:
     for later in range(1, len(beside)):
         wanted[later] &= ~(wanted[:later] & (other[:later] == other[later])).any(axis=0)
 
-    thin_ray, thin = _beside_thin_solids(sweep)
-    row = np.searchsorted(rays, thin_ray).clip(max=len(rays) - 1)
-    new = (rays[row] == thin_ray) & (solid[row] != thin)
-    new &= ~(wanted[:, row] & (other[:, row] == thin)).any(axis=0)
-    row, thin = row[new], thin[new].astype(np.int32)
-    order = np.lexsort((thin, row))
-    row, thin = row[order], thin[order]
-    rank = np.arange(len(row)) - np.searchsorted(row, row)
-
-    layers = [(every_row, solid, rays)]
-    layers += [
-        (every_row[chosen], other[side, chosen], beside[side, chosen])
-        for side, chosen in enumerate(wanted)
-    ]
-    layers += [
-        (row[rank == layer], thin[rank == layer], rays[row[rank == layer]])
-        for layer in range(rank.max(initial=-1) + 1)
-    ]
+    layers: list[_Layer] = [(np.arange(len(rays)), solid, rays)]
+    for side, chosen in enumerate(wanted):
+        layers.append((np.flatnonzero(chosen), other[side, chosen], beside[side, chosen]))
+    known = np.vstack([solid, np.where(wanted, other, np.int32(NO_SURFACE))])
+    layers += _thin_layers(sweep, rays, known)
     bounds = np.cumsum([0, *(len(layer[0]) for layer in layers)])
     row, surface, seen_by = (np.concatenate(columns) for columns in zip(*layers, strict=True))
     # Surfaces without an edge fill the beam of the ray whose axis meets them.
@@ -166,6 +145,36 @@ def _targets_of(sweep: Sweep, rays: Indices) -> _Targets:
         sweep, rays[row[unseen]], surface[unseen], range_m[:, unseen]
     )
     return _Targets(row, surface, range_m, brightness, cosine, bounds)
+
+
+def _neighbours(rays: Indices, shape: tuple[int, int]) -> Indices:
+    """Rays ``(4, M)`` to the left, to the right, above and below; the same ones at the borders."""
+    num_beams, num_shots = shape
+    beam, shot = np.divmod(rays, num_shots)
+    return np.stack(
+        [
+            beam * num_shots + (shot + 1) % num_shots,
+            beam * num_shots + (shot - 1) % num_shots,
+            np.where(beam > 0, rays - num_shots, rays),
+            np.where(beam < num_beams - 1, rays + num_shots, rays),
+        ]
+    )
+
+
+def _thin_layers(sweep: Sweep, rays: Indices, known: Surfaces) -> list[_Layer]:
+    """Pairs of rays and thin solids that are not ``known`` ``(L, M)``, each ray once in a layer."""
+    thin_ray, thin = _beside_thin_solids(sweep)
+    row = np.searchsorted(rays, thin_ray).clip(max=len(rays) - 1)
+    is_new = (rays[row] == thin_ray) & (known[:, row] != thin).all(axis=0)
+    row, thin = row[is_new], thin[is_new].astype(np.int32)
+    order = np.lexsort((thin, row))
+    row, thin = row[order], thin[order]
+    rank = np.arange(len(row)) - np.searchsorted(row, row)
+    layers = []
+    for layer in range(rank.max(initial=-1) + 1):
+        chosen = rank == layer
+        layers.append((row[chosen], thin[chosen], rays[row[chosen]]))
+    return layers
 
 
 def _brightness_of_solids(
