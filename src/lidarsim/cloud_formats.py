@@ -35,10 +35,11 @@ _MOST_RATIO = 100  # size of data over size of its file; LZF reaches 88
 _OTHER_WIDTHS = (5, 6, 7, 8, 10, 12)
 # Rows whose parts are compared, see ``_are_parts``: a multiple of 2 and 3.
 _COMPARED_ROWS, _FEWEST_ROWS = 4080, 192
-_PLY_NAMES = ["char", "uchar", "short", "ushort", "int", "uint", "float", "double"]
-_PLY_NAMES += ["int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64"]
-_PLY_CODES = ["i1", "u1", "<i2", "<u2", "<i4", "<u4", "<f4", "<f8"]
-_PLY_TYPES = dict(zip(_PLY_NAMES, _PLY_CODES * 2, strict=True))
+_PLY_TYPES = {
+    "char": "i1", "uchar": "u1", "short": "<i2", "ushort": "<u2", "int": "<i4", "uint": "<u4",
+    "float": "<f4", "double": "<f8", "int8": "i1", "uint8": "u1", "int16": "<i2",
+    "uint16": "<u2", "int32": "<i4", "uint32": "<u4", "float32": "<f4", "float64": "<f8",
+}  # fmt: skip
 _PLY_KINDS: dict[str, Literal["<", ">"]] = {
     "ascii 1.0": "<",
     "binary_little_endian 1.0": "<",

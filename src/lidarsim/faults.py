@@ -39,7 +39,7 @@ _NUM_SECTORS = 3
 _LEAST_SURE = 0.5  # share of the points whose beam is sure
 _LEAST_POINTS = 10  # of a class of vehicles
 # Classes of KITTI-360 and of SemanticKITTI; only the latter has classes from 45 on.
-_VEHICLES = (*range(26, 34),)
+_VEHICLES = tuple(range(26, 34))
 _SEMANTIC_KITTI, _ITS_VEHICLES = 45, (10, 11, 13, 15, 16, 18, 20, 252, *range(256, 260))
 
 

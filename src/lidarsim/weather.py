@@ -26,7 +26,7 @@ from lidarsim.scan import (
     run_effect,
 )
 from lidarsim.scene import Interval, Pose, Primitive, Scene, Semantic, Shape
-from lidarsim.sweep import Effect, Origin
+from lidarsim.sweep import Echoes, Effect, Origin
 
 #: Added points have this class plus their ``Origin``: no data set uses these numbers.
 ADDED_CLASS = 0xFF00
@@ -260,11 +260,7 @@ def _result(
 ) -> WeatheredScan:
     """Return the points of the remaining echoes: recorded ones, then echoes of the air."""
     echoes = list(sweep.echoes())
-    seen = [np.isfinite(echo.range_m) & (echo.power > 0) for echo in echoes]
-    for second, is_seen in zip(echoes[1:], seen[1:], strict=True):
-        is_seen &= seen[0]
-        apart_m = second.range_m[is_seen] - echoes[0].range_m[is_seen]
-        is_seen[is_seen] = np.abs(apart_m) > SECOND_RETURN_M
+    seen = _detected(echoes)
     points = scan.points.copy()
     intensity = None if scan.intensity is None else scan.intensity.copy()
     stays = np.ones(len(scan), dtype=bool)
@@ -301,15 +297,25 @@ def _result(
         "dimmed": dimmed, "added": _by_origin(made_by),
     }  # fmt: skip
     return WeatheredScan(
-        np.concatenate([points[kept], new]),
-        intensity,
-        labels,
-        np.concatenate([kept, np.full(len(new), -1)]),
-        np.concatenate([kept, shot]),
-        np.concatenate([np.zeros(len(kept), dtype=np.uint8), made_by]),
-        records,
-        report,
+        points=np.concatenate([points[kept], new]),
+        intensity=intensity,
+        labels=labels,
+        index=np.concatenate([kept, np.full(len(new), -1)]),
+        shot=np.concatenate([kept, shot]),
+        origins=np.concatenate([np.zeros(len(kept), dtype=np.uint8), made_by]),
+        effects=records,
+        report=report,
     )
+
+
+def _detected(echoes: list[Echoes]) -> list[NDArray[np.bool_]]:
+    """Which shots report each echo; a second one has to be apart from the first."""
+    detected = [np.isfinite(echo.range_m) & (echo.power > 0) for echo in echoes]
+    for second, is_seen in zip(echoes[1:], detected[1:], strict=True):
+        is_seen &= detected[0]
+        apart_m = second.range_m[is_seen] - echoes[0].range_m[is_seen]
+        is_seen[is_seen] = np.abs(apart_m) > SECOND_RETURN_M
+    return detected
 
 
 def _by_origin(origins: NDArray[np.uint8]) -> dict[str, int]:

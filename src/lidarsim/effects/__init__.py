@@ -62,12 +62,12 @@ RAY_EFFECTS: tuple[Effect, ...] = (
 #: Effects on the echoes of the cast, in order: surfaces, the optical path, the air, detection, and
 #: measurement.
 ECHO_EFFECTS: tuple[Effect, ...] = (
-    *(EgoOcclusion(), DiffuseReflection(), SurfaceTexture(), WetGround(), RetroReflection()),
-    *(Glass(), PolishedMetal(), MixedPixels(), WeakPatches()),
-    *(Fog(), Rain(), Snow(), Spray()),
-    *(SunGlare(), Blooming(), SoftRaydrop(), DetectionLimit(), LostShots()),
-    *(RangeNoise(), LaserCalibration()),
-)
+    EgoOcclusion(), DiffuseReflection(), SurfaceTexture(), WetGround(), RetroReflection(),
+    Glass(), PolishedMetal(), MixedPixels(), WeakPatches(),
+    Fog(), Rain(), Snow(), Spray(),
+    SunGlare(), Blooming(), SoftRaydrop(), DetectionLimit(), LostShots(),
+    RangeNoise(), LaserCalibration(),
+)  # fmt: skip
 EFFECTS = (*RAY_EFFECTS, *ECHO_EFFECTS)
 
 __all__ = ["ECHO_EFFECTS", "EFFECTS", "RAY_EFFECTS", "surface_power"]
