@@ -7,12 +7,14 @@ import json
 import logging
 import os
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 from torch import nn
 
+from lidarsim import simulate
 from r3dpa.cli import main
 from r3dpa.io import only_writer
 
@@ -42,6 +44,7 @@ def pytest_ignore_collect(collection_path, config):
 def pytest_collection_finish():
     gc.enable()
     gc.freeze()
+    gc.set_threshold(10_000)  # parsers make many small objects and few cycles
 
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -68,9 +71,29 @@ def real_scans_dir(pytestconfig) -> Path:
 
 
 @pytest.fixture(scope="session")
-def smoke_root(tmp_path_factory) -> Path:
-    """Root of the simulated scans of conf/smoke.yaml; made by whoever trains first."""
-    return tmp_path_factory.mktemp("smoke") / "data"
+def make_once(tmp_path_factory):
+    """``make_once(name, make)``: folder that the first process in need of it fills.
+
+    All processes of one `pytest -n` share it; ``make(folder)`` runs in one of them.
+    """
+    top = tmp_path_factory.getbasetemp()
+    top = top.parent if "PYTEST_XDIST_WORKER" in os.environ else top
+
+    def folder_of(name: str, make: Callable[[Path], object]) -> Path:
+        folder, done = top / name, top / f"{name}.done"
+        with only_writer(top / f"{name}.lock", f"makes {folder}", wait=True):
+            if not done.exists():
+                make(folder)
+                done.touch()
+        return folder
+
+    return folder_of
+
+
+@pytest.fixture(scope="session")
+def smoke_root(make_once) -> Path:
+    """Root of the simulated scans of conf/smoke.yaml."""
+    return make_once("smoke", lambda root: simulate(root, 12))
 
 
 @pytest.fixture(scope="session")
@@ -91,20 +114,13 @@ def smoke_args(smoke_root):
 
 
 @pytest.fixture(scope="session")
-def trained_once(smoke_args, tmp_path_factory):
-    """``trained_once(stage, *more)``: last checkpoint of a stage at smoke size.
-
-    Of the processes of one `pytest -n`, the first to ask trains it for all.
-    """
-    folder = tmp_path_factory.getbasetemp()
-    folder = folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
+def trained_once(smoke_args, make_once):
+    """``trained_once(stage, *more)``: last checkpoint of a stage at smoke size."""
 
     def checkpoint(stage: str, *more: str) -> Path:
-        last = folder / stage / "checkpoints" / "last.ckpt"
-        with only_writer(folder / f"{stage}.lock", "trains", wait=True):
-            if not last.exists():
-                main(smoke_args(stage, folder / stage, "--trainer.logger=false", *more))
-        return last
+        words = ["--trainer.logger=false", *more]
+        run_dir = make_once(stage, lambda folder: main(smoke_args(stage, folder, *words)))
+        return run_dir / "checkpoints" / "last.ckpt"
 
     return checkpoint
 

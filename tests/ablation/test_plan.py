@@ -71,8 +71,8 @@ def test_a_second_seed_repeats_all_but_the_prior():
 
 def test_the_name_depends_on_given_weights_which_replace_the_prior(tmp_path):
     names = []
+    weights = tmp_path / "rgb.pt"
     for content in ("one", "other"):
-        weights = tmp_path / f"{content}.pt"
         weights.write_text(content)
         rows = rows_of(plan_of("demo", tables=TABLES / "table_2", rgb_weights=weights))
         assert str(weights) in rows["table_2", "rgb"].stages[0][-1].words
@@ -97,8 +97,7 @@ def test_released_files_stand_for_trainings(tmp_path):
     weights.write_bytes(b"weights")
     samples.mkdir()
     released = {"r2dm": weights, "ultralidar": samples}
-    scale = TABLES / "scale" / "demo.yaml"
-    plan = make_plan(TABLES / "table_1", scale, (0,), tmp_path, resolved, released=released)
+    plan = plan_of("demo", tables=TABLES / "table_1", released=released)
     rows = rows_of(plan)
     assert next(key for _, key in rows) == "ultralidar"
     assert not any(stage.words[0] == "r2dm" for stage in plan.stages)

@@ -19,14 +19,12 @@ CSV_LOGGER = {
 
 
 @pytest.fixture(scope="session")
-def joint_run(smoke_args, vae_checkpoint, tmp_path_factory):
+def joint_run(smoke_args, vae_checkpoint, make_once):
     """Run of the joint stage whose last and averaged weights have moved apart."""
-    run_dir = tmp_path_factory.mktemp("joint")
     more = [f"--trainer.logger={json.dumps([CSV_LOGGER])}", "--trainer.limit_val_batches=0"]
     more += ["--model.init_args.optimizer.lr=1e-2", "--model.init_args.ema_decay=0.5"]
     more += ["--model.init_args.init_from", str(vae_checkpoint), "--trainer.callbacks=[]"]
-    main(smoke_args("joint", run_dir, *more))
-    return run_dir
+    return make_once("joint", lambda run_dir: main(smoke_args("joint", run_dir, *more)))
 
 
 @pytest.fixture(scope="session")

@@ -4,15 +4,12 @@ Networks and images are tiny here; the slow tests start them at their own sizes.
 """
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import torch
 import yaml
 
-from lidarsim import simulate
 from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint
 from r3dpa.cli import main
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
@@ -146,7 +143,6 @@ def net(name):
 @pytest.mark.parametrize(("experiment", "data"), STARTS.items())
 def test_experiments_with_tiny_networks(experiment, data, start, smoke_root, tmp_path):
     """Each with other data, all of which are the scans of the smoke size here."""
-    simulate(smoke_root, 12)  # unless they are there
     folder, stage = experiment.split("/")
     configs = ["trainer", f"data/{data}", f"experiment/{stage}"]
     if folder == "demo":
@@ -183,7 +179,6 @@ def test_experiments_with_tiny_networks(experiment, data, start, smoke_root, tmp
     [name if name == "demo" else pytest.param(name, marks=pytest.mark.slow) for name in R3DPA_S],
 )
 def test_r3dpa_s_and_its_demo_start(name, start, smoke_root, tmp_path):
-    simulate(smoke_root, 12)  # unless they are there
     given = R3DPA_S[name]
     vae, sit = (
         yaml.safe_load((CONF / f"r3dpa_s/{part}.yaml").read_text())["init_args"]
@@ -198,7 +193,7 @@ def test_r3dpa_s_and_its_demo_start(name, start, smoke_root, tmp_path):
     if "demo_folder" in given:
         settings["data.init_args.scans"] = smoke_root
     else:
-        settings |= {"data.init_args.root": tmp_path / "data"} | SIMULATED
+        settings |= {"data.init_args.root": tmp_path / "data", "data.init_args.num_scans": 4}
     if name != "trained":
         codec = RangeCodec("log2", return_channel=True)
         exported = None if name == "flow" else sit
@@ -237,7 +232,7 @@ def test_the_second_edition_of_r3dpa_s_starts(name, start, tmp_path):
     start(["trainer", *(f"r3dpa_s_2/{part}" for part in files)], settings)
 
 
-def test_few_steps_keep_the_arguments_of_the_sit_of_the_flow(tmp_path):
+def test_few_steps_keep_the_arguments_of_the_sit_of_the_flow(ended, tmp_path):
     """In a process of its own, as users run it: others parsed before it hid that they were lost."""
     overlay = tmp_path / "few_step.yaml"
     sit = {"class_path": "r3dpa.nn.AverageVelocitySiT", "init_args": {"average_blocks": 3}}
@@ -245,8 +240,8 @@ def test_few_steps_keep_the_arguments_of_the_sit_of_the_flow(tmp_path):
     overlay.write_text(yaml.safe_dump({"model": model}))
     names = ("trainer", "r3dpa_s/data", "r3dpa_s/flow_matching")
     configs = [f"--config={path}" for path in (*(CONF / f"{n}.yaml" for n in names), overlay)]
-    command = [sys.executable, "-m", "r3dpa", "fit", *configs, "--print_config"]
-    printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    status, printed = ended(["fit", *configs, "--print_config"])
+    assert status == 0, printed
     network = yaml.safe_load(printed)["model"]["init_args"]["sit"]
     expected = yaml.safe_load((CONF / "r3dpa_s/sit.yaml").read_text())["init_args"]
     assert network["class_path"] == sit["class_path"]

@@ -209,14 +209,6 @@ def test_without_scenes_the_losses_alone_are_reported(words, tmp_path, capsys):
     assert not (tmp_path / "evaluation").exists()
 
 
-def test_a_stage_without_velocity_says_so(smoke_args, vae_checkpoint, tmp_path, caplog):
-    fixed = smoke_args("vae_alignment", tmp_path, "--ckpt_path", str(vae_checkpoint), *QUIET)
-    with caplog.at_level("INFO"):
-        main(["test", *fixed[1:]])
-    assert "stage vae_alignment has nothing to sample" in caplog.text
-    assert not (tmp_path / "evaluation").exists()
-
-
 @pytest.mark.ddp
 @pytest.mark.slow  # two more starts of the command
 def test_two_processes_give_the_numbers_of_one(reference, words, tmp_path):

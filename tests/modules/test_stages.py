@@ -107,9 +107,12 @@ def test_two_processes_equal_one_with_the_global_batch(stage, smoke_args, from_p
 @pytest.mark.parametrize(
     "command", [pytest.param("validate", marks=pytest.mark.slow), "test", "predict"]
 )
-def test_a_checkpoint_is_evaluated(command, smoke_args, vae_checkpoint, tmp_path, capsys):
+def test_a_checkpoint_is_evaluated(command, smoke_args, vae_checkpoint, tmp_path, capsys, caplog):
     arguments = smoke_args("vae_alignment", tmp_path, "--ckpt_path", str(vae_checkpoint))
-    main([command, *arguments[1:], "--trainer.logger=false"])
+    with caplog.at_level("INFO"):
+        main([command, *arguments[1:], "--trainer.logger=false"])
+    assert ("vae_alignment has nothing to sample" in caplog.text) == (command == "test")
+    assert not (tmp_path / "evaluation").exists()
     assert ("range_error_m" in capsys.readouterr().out) == (command != "predict")
     pictures = list((tmp_path / "pictures").glob(f"{command[:3]}*_reconstruction_*.png"))
     assert len(pictures) == (command != "predict")
