@@ -57,6 +57,11 @@ THIN_DECODER = {
     "num_res_blocks": 0,
 }
 
+CSV_LOGGER = {
+    "class_path": "lightning.pytorch.loggers.CSVLogger",
+    "init_args": {"save_dir": "", "name": ""},
+}
+
 
 @pytest.fixture(scope="session")
 def real_scans_dir(pytestconfig) -> Path:
@@ -136,6 +141,15 @@ def flow_checkpoint(trained_once, vae_checkpoint) -> Path:
     """Checkpoint of the flow-matching stage at smoke size, trained for three steps."""
     more = ["--trainer.limit_val_batches=0", "--trainer.callbacks=[]"]
     return trained_once("flow_matching", *more, "--model.init_args.init_from", str(vae_checkpoint))
+
+
+@pytest.fixture(scope="session")
+def joint_run(smoke_args, vae_checkpoint, make_once):
+    """Run of the joint stage whose last and averaged weights have moved apart."""
+    more = [f"--trainer.logger={json.dumps([CSV_LOGGER])}", "--trainer.limit_val_batches=0"]
+    more += ["--model.init_args.optimizer.lr=1e-2", "--model.init_args.ema_decay=0.5"]
+    more += ["--model.init_args.init_from", str(vae_checkpoint), "--trainer.callbacks=[]"]
+    return make_once("joint", lambda run_dir: main(smoke_args("joint", run_dir, *more)))
 
 
 @pytest.fixture

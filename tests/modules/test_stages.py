@@ -122,13 +122,6 @@ def test_a_checkpoint_is_evaluated(command, smoke_args, vae_checkpoint, tmp_path
     assert all(len(read_scan(path)) > 0 for path in written)
 
 
-@pytest.fixture(scope="module")
-def joint_run(smoke_args, tmp_path_factory):
-    run_dir = tmp_path_factory.mktemp("joint")
-    main(smoke_args("joint", run_dir, *QUICK))
-    return run_dir
-
-
 def test_saved_config_names_what_ran(joint_run):
     config = yaml.safe_load((joint_run / "config.yaml").read_text())
     assert config["model"]["class_path"] == "r3dpa.modules.JointAlignment"
