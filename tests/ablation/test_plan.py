@@ -71,8 +71,8 @@ def test_a_second_seed_repeats_all_but_the_prior():
 
 def test_the_name_depends_on_given_weights_which_replace_the_prior(tmp_path):
     names = []
-    weights = tmp_path / "rgb.pt"
     for content in ("one", "other"):
+        weights = tmp_path / f"{content}.pt"
         weights.write_text(content)
         rows = rows_of(plan_of("demo", tables=TABLES / "table_2", rgb_weights=weights))
         assert str(weights) in rows["table_2", "rgb"].stages[0][-1].words

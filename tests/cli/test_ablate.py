@@ -39,7 +39,7 @@ def test_an_option_that_fit_refuses_is_named(capsys):
         ([str(TABLES), "--scale", "huge"], "unknown scale .*; choose from demo"),
         ([str(TABLES), "--seeds", "0", "0"], "different numbers"),
         ([str(TABLES), "--rgb_weights", "none.pt"], "none.pt does not exist"),
-        ([str(TABLES), "--released.r2d2", "none.pt"], r"--released\.r2d2: unknown row"),
+        ([str(TABLES / "table_4"), "--released.r2d2", "none.pt"], r"--released\.r2d2: unknown row"),
     ],
 )
 def test_a_wrong_argument_is_named(words, message, tmp_path, monkeypatch):

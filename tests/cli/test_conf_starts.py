@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from fault_commands import Command
 
 from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint
 from r3dpa.cli import main
@@ -227,7 +228,7 @@ def test_the_second_edition_of_r3dpa_s_starts(name, start, tmp_path):
     start(["trainer", *(f"r3dpa_s_2/{part}" for part in files)], settings)
 
 
-def test_few_steps_keep_the_arguments_of_the_sit_of_the_flow(ended, tmp_path):
+def test_few_steps_keep_the_arguments_of_the_sit_of_the_flow(tmp_path):
     """In a process of its own, as users run it: others parsed before it hid that they were lost."""
     overlay = tmp_path / "few_step.yaml"
     sit = {"class_path": "r3dpa.nn.AverageVelocitySiT", "init_args": {"average_blocks": 3}}
@@ -235,7 +236,8 @@ def test_few_steps_keep_the_arguments_of_the_sit_of_the_flow(ended, tmp_path):
     overlay.write_text(yaml.safe_dump({"model": model}))
     names = ("trainer", "r3dpa_s/data", "r3dpa_s/flow_matching")
     configs = [f"--config={path}" for path in (*(CONF / f"{n}.yaml" for n in names), overlay)]
-    status, printed = ended(["fit", *configs, "--print_config"])
+    command = Command(tmp_path / "log", ["fit", *configs, "--print_config"])
+    status, printed = command.end()
     assert status == 0, printed
     network = yaml.safe_load(printed)["model"]["init_args"]["sit"]
     expected = yaml.safe_load((CONF / "r3dpa_s/sit.yaml").read_text())["init_args"]

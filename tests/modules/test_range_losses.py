@@ -72,7 +72,7 @@ def test_ranges_and_returns_are_learned_without_discriminator(modes):
 
 @pytest.mark.parametrize("modes", [1, 2])
 def test_intensity_and_class_are_learned_beside_them(modes):
-    module = train(range_module(modes, labelled=True), LabelledData(12))
+    module = train(range_module(modes, labelled=True), LabelledData(30))
     names = {"reconstruction", "returns", "intensity", "classes"}
     assert set(module.parts[0]) == names | {"kl"}
     for name in names:
