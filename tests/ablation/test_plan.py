@@ -92,7 +92,8 @@ def test_the_name_depends_on_the_training_not_on_the_test_or_the_folder(tmp_path
         assert (names_of(plan.stages) == usual) == (section == "scorer")
 
 
-def test_released_files_stand_for_trainings(tmp_path):
+def test_released_files_stand_for_trainings(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # jobs write their configuration into the folder of the plan
     weights, samples = tmp_path / "r2dm.pth", tmp_path / "samples"
     weights.write_bytes(b"weights")
     samples.mkdir()

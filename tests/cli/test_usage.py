@@ -266,7 +266,7 @@ def fitted(smoke_args, make_once):
         folder.mkdir()
         with (folder / "stdout").open("w") as out, (folder / "stderr").open("w") as errors:
             command = [sys.executable, "-m", "r3dpa", *words]
-            subprocess.run(command, stdout=out, stderr=errors, timeout=200, check=True)
+            subprocess.run(command, stdout=out, stderr=errors, timeout=400, check=True)
 
     folder = make_once("fitted", fit)
     stdout, stderr = ((folder / name).read_text() for name in ("stdout", "stderr"))
