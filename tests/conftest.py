@@ -7,12 +7,14 @@ import json
 import logging
 import os
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 from torch import nn
 
+from lidarsim import simulate
 from r3dpa.cli import main
 from r3dpa.io import only_writer
 
@@ -42,6 +44,7 @@ def pytest_ignore_collect(collection_path, config):
 def pytest_collection_finish():
     gc.enable()
     gc.freeze()
+    gc.set_threshold(10_000)  # parsers make many small objects and few cycles
 
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -52,6 +55,11 @@ THIN_DECODER = {
     "channel_multipliers": [1, 1, 1],
     "strides": [[2, 2], [2, 2]],
     "num_res_blocks": 0,
+}
+
+CSV_LOGGER = {
+    "class_path": "lightning.pytorch.loggers.CSVLogger",
+    "init_args": {"save_dir": "", "name": ""},
 }
 
 
@@ -68,9 +76,29 @@ def real_scans_dir(pytestconfig) -> Path:
 
 
 @pytest.fixture(scope="session")
-def smoke_root(tmp_path_factory) -> Path:
-    """Root of the simulated scans of conf/smoke.yaml; made by whoever trains first."""
-    return tmp_path_factory.mktemp("smoke") / "data"
+def make_once(tmp_path_factory):
+    """``make_once(name, make)``: folder that the first process in need of it fills.
+
+    All processes of one `pytest -n` share it; ``make(folder)`` runs in one of them.
+    """
+    top = tmp_path_factory.getbasetemp()
+    top = top.parent if "PYTEST_XDIST_WORKER" in os.environ else top
+
+    def folder_of(name: str, make: Callable[[Path], object]) -> Path:
+        folder, done = top / name, top / f"{name}.done"
+        with only_writer(top / f"{name}.lock", f"makes {folder}", wait=True):
+            if not done.exists():
+                make(folder)
+                done.touch()
+        return folder
+
+    return folder_of
+
+
+@pytest.fixture(scope="session")
+def smoke_root(make_once) -> Path:
+    """Root of the simulated scans of conf/smoke.yaml."""
+    return make_once("smoke", lambda root: simulate(root, 12))
 
 
 @pytest.fixture(scope="session")
@@ -91,20 +119,13 @@ def smoke_args(smoke_root):
 
 
 @pytest.fixture(scope="session")
-def trained_once(smoke_args, tmp_path_factory):
-    """``trained_once(stage, *more)``: last checkpoint of a stage at smoke size.
-
-    Of the processes of one `pytest -n`, the first to ask trains it for all.
-    """
-    folder = tmp_path_factory.getbasetemp()
-    folder = folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
+def trained_once(smoke_args, make_once):
+    """``trained_once(stage, *more)``: last checkpoint of a stage at smoke size."""
 
     def checkpoint(stage: str, *more: str) -> Path:
-        last = folder / stage / "checkpoints" / "last.ckpt"
-        with only_writer(folder / f"{stage}.lock", "trains", wait=True):
-            if not last.exists():
-                main(smoke_args(stage, folder / stage, "--trainer.logger=false", *more))
-        return last
+        words = ["--trainer.logger=false", *more]
+        run_dir = make_once(stage, lambda folder: main(smoke_args(stage, folder, *words)))
+        return run_dir / "checkpoints" / "last.ckpt"
 
     return checkpoint
 
@@ -120,6 +141,15 @@ def flow_checkpoint(trained_once, vae_checkpoint) -> Path:
     """Checkpoint of the flow-matching stage at smoke size, trained for three steps."""
     more = ["--trainer.limit_val_batches=0", "--trainer.callbacks=[]"]
     return trained_once("flow_matching", *more, "--model.init_args.init_from", str(vae_checkpoint))
+
+
+@pytest.fixture(scope="session")
+def joint_run(smoke_args, vae_checkpoint, make_once):
+    """Run of the joint stage whose last and averaged weights have moved apart."""
+    more = [f"--trainer.logger={json.dumps([CSV_LOGGER])}", "--trainer.limit_val_batches=0"]
+    more += ["--model.init_args.optimizer.lr=1e-2", "--model.init_args.ema_decay=0.5"]
+    more += ["--model.init_args.init_from", str(vae_checkpoint), "--trainer.callbacks=[]"]
+    return make_once("joint", lambda run_dir: main(smoke_args("joint", run_dir, *more)))
 
 
 @pytest.fixture

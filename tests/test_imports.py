@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -67,6 +68,7 @@ def area_of(name: str) -> str:
     return package if package == "lidarsim" else rest.partition(".")[0]
 
 
+@cache
 def imported(source: str) -> set[str]:
     """Dotted names of both packages that a source imports, but for the type checker alone."""
     tree = ast.parse(source)
@@ -90,6 +92,7 @@ def violations(source: str, area: str) -> set[str]:
     return {area_of(name) for name in imported(source)} - ALLOWED[area] - {area} - anywhere
 
 
+@cache
 def modules() -> dict[str, Path]:
     paths = [path for package in PACKAGES for path in (SOURCE / package).rglob("*.py")]
     names = {".".join(path.relative_to(SOURCE).with_suffix("").parts): path for path in paths}
@@ -162,13 +165,14 @@ for name in {names}:
 loaded = {{name.partition(".")[0] for name in sys.modules}}
 print(seconds, *loaded & {{"torch", "r3dpa", "lightning", "yaml", "tqdm", "filelock"}})
 """
-    runs = [
-        subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-        for _ in range(2)
-    ]
-    seconds = [float(run.stdout.split()[0]) for run in runs]
-    assert [run.stdout.split()[1:] for run in runs] == [[], []]
-    assert min(seconds) < 0.3
+    command = [sys.executable, "-c", code]
+    for _ in range(3):  # a first import may read from a cold disk
+        run = subprocess.run(command, capture_output=True, text=True, check=True)
+        seconds, *loaded = run.stdout.split()
+        assert not loaded
+        if float(seconds) < 0.3:
+            return
+    pytest.fail(f"lidarsim takes {seconds} s to import")
 
 
 def test_sampling_loads_neither_lightning_nor_baselines():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import json
 import re
-from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -35,34 +35,33 @@ NO_VARIABLES = {"found", "own", "made", "one", "told", "asked"}
 NO_FUNCTIONS = NO_VARIABLES | {"filled", "kept", "given", "taken"}
 
 
-def texts() -> Iterator[tuple[Path, str]]:
-    """Files as text; of notebooks their cells without the outputs."""
+@cache
+def lines() -> dict[Path, str]:
+    """Files, of notebooks the cells, as one line each: no sentence or string is wrapped."""
+    texts = {}
     for suffix in (".py", ".md", ".yaml", ".html", ".js"):
         for folder in ("src", "conf"):
             for path in sorted((ROOT / folder).rglob(f"*{suffix}")):
-                yield path, path.read_text()
+                texts[path] = path.read_text()
     for path in (*sorted(ROOT.glob("*.md")), *sorted((ROOT / "notebooks").glob("*.md"))):
-        yield path, path.read_text()
+        texts[path] = path.read_text()
     for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
         cells = json.loads(path.read_text())["cells"]
-        yield path, "\n\n".join("".join(cell["source"]) for cell in cells)
+        texts[path] = "\n\n".join("".join(cell["source"]) for cell in cells)
+    wrapped = re.compile(r"\"?\s*\n\s*(# ?|f?\"(?=\w))?")
+    return {path: wrapped.sub(" ", text) for path, text in texts.items()}
 
 
-def sources() -> Iterator[tuple[Path, ast.Module]]:
-    for path in sorted((ROOT / "src").rglob("*.py")):
-        yield path, ast.parse(path.read_text())
-
-
-def joined(text: str) -> str:
-    """The text with wrapped sentences, comments and adjoining strings on one line."""
-    return re.sub(r"\"?\s*\n\s*(# ?|f?\"(?=\w))?", " ", text)
+@cache
+def sources() -> dict[Path, ast.Module]:
+    paths = sorted((ROOT / "src").rglob("*.py"))
+    return {path: ast.parse(path.read_text()) for path in paths}
 
 
 @pytest.mark.parametrize("pattern", BANNED)
 def test_no_banned_phrase(pattern):
     hits = []
-    for path, text in texts():
-        line = joined(text)
+    for path, line in lines().items():
         for match in re.finditer(pattern, line, re.IGNORECASE):
             around = line[max(match.start() - 60, 0) : match.end() + 60]
             hits.append(f"{path.relative_to(ROOT)}: {around}")
@@ -71,7 +70,7 @@ def test_no_banned_phrase(pattern):
 
 def test_names_of_functions_and_variables_say_what_they_hold():
     hits = []
-    for path, tree in sources():
+    for path, tree in sources().items():
         for node in ast.walk(tree):
             name, banned = "", NO_VARIABLES
             if isinstance(node, ast.FunctionDef):
@@ -87,7 +86,7 @@ def test_names_of_functions_and_variables_say_what_they_hold():
 
 def test_errors_begin_in_lower_case_and_end_without_a_period():
     hits = []
-    for path, tree in sources():
+    for path, tree in sources().items():
         for node in ast.walk(tree):
             if not (isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call)):
                 continue

@@ -92,13 +92,13 @@ def test_the_name_depends_on_the_training_not_on_the_test_or_the_folder(tmp_path
         assert (names_of(plan.stages) == usual) == (section == "scorer")
 
 
-def test_released_files_stand_for_trainings(tmp_path):
+def test_released_files_stand_for_trainings(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # jobs write their configuration into the folder of the plan
     weights, samples = tmp_path / "r2dm.pth", tmp_path / "samples"
     weights.write_bytes(b"weights")
     samples.mkdir()
     released = {"r2dm": weights, "ultralidar": samples}
-    scale = TABLES / "scale" / "demo.yaml"
-    plan = make_plan(TABLES / "table_1", scale, (0,), tmp_path, resolved, released=released)
+    plan = plan_of("demo", tables=TABLES / "table_1", released=released)
     rows = rows_of(plan)
     assert next(key for _, key in rows) == "ultralidar"
     assert not any(stage.words[0] == "r2dm" for stage in plan.stages)

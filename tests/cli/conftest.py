@@ -1,6 +1,5 @@
-"""A short training and a checkpoint of random weights, shared by the tests of all commands."""
+"""Commands in processes of their own, their scans, and a checkpoint of random weights."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -9,24 +8,7 @@ from fault_commands import Command, fit_words
 from tiny_networks import tiny_checkpoint
 
 from r3dpa.callbacks import scene_scoring
-from r3dpa.cli import main
 from r3dpa.metrics import scene
-
-CSV_LOGGER = {
-    "class_path": "lightning.pytorch.loggers.CSVLogger",
-    "init_args": {"save_dir": "", "name": ""},
-}
-
-
-@pytest.fixture(scope="session")
-def joint_run(smoke_args, vae_checkpoint, tmp_path_factory):
-    """Run of the joint stage whose last and averaged weights have moved apart."""
-    run_dir = tmp_path_factory.mktemp("joint")
-    more = [f"--trainer.logger={json.dumps([CSV_LOGGER])}", "--trainer.limit_val_batches=0"]
-    more += ["--model.init_args.optimizer.lr=1e-2", "--model.init_args.ema_decay=0.5"]
-    more += ["--model.init_args.init_from", str(vae_checkpoint), "--trainer.callbacks=[]"]
-    main(smoke_args("joint", run_dir, *more))
-    return run_dir
 
 
 @pytest.fixture(scope="session")

@@ -1,7 +1,7 @@
 """Real commands in processes of their own, the faults put into them, and what must hold after.
 
-A command runs in a fork of a server that has imported r3dpa and nothing else: as from the shell,
-without the seconds of the imports. Signals, limits and full disks are those of the system.
+A command runs in a fork of a server that has imported r3dpa and has parsed nothing: as from the
+shell, without the seconds of the imports. Signals, limits and full disks are real.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ from r3dpa.data.feature_grids import GridSettings
 
 CONTEXT = multiprocessing.get_context("forkserver")
 CONTEXT.set_forkserver_preload(
-    [f"r3dpa.cli.{name}" for name in ("stages", "features", "sample", "evaluate")]
+    [f"r3dpa.cli.{name}" for name in ("fit", "stages", "features", "sample", "evaluate")]
+    + ["r3dpa.baselines", "wandb"]  # imported by each parser of a stage
 )
 PATIENCE_S = 100
 STEPS = 4

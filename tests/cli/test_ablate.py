@@ -39,7 +39,7 @@ def test_an_option_that_fit_refuses_is_named(capsys):
         ([str(TABLES), "--scale", "huge"], "unknown scale .*; choose from demo"),
         ([str(TABLES), "--seeds", "0", "0"], "different numbers"),
         ([str(TABLES), "--rgb_weights", "none.pt"], "none.pt does not exist"),
-        ([str(TABLES), "--released.r2d2", "none.pt"], r"--released\.r2d2: unknown row"),
+        ([str(TABLES / "table_4"), "--released.r2d2", "none.pt"], r"--released\.r2d2: unknown row"),
     ],
 )
 def test_a_wrong_argument_is_named(words, message, tmp_path, monkeypatch):
@@ -101,7 +101,11 @@ def processes(monkeypatch):
 
 @pytest.fixture
 def command(tmp_path, monkeypatch):
-    """Words that run two rows at the size of conf/smoke.yaml: a VAE, without and with alignment."""
+    """Words that run two rows at the size of conf/smoke.yaml: a VAE, without and with alignment.
+
+    Their paths are relative, so that all tests have the same commands, which are resolved once.
+    """
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("r3dpa.cli.bench.resolve_config", resolved)
     smoke = yaml.safe_load((CONF / "smoke.yaml").read_text())
     smoke["trainer"] |= {"callbacks": [], "limit_val_batches": 0}
@@ -118,8 +122,7 @@ def command(tmp_path, monkeypatch):
         rows[key] = {"label": f"row {key}", "published": {"JSD": 5.0}, "commands": commands}
     table = {"caption": "A table.", "rows": rows, "better": [["b", "a"]]}
     (tmp_path / "table_x.yaml").write_text(yaml.safe_dump(table, sort_keys=False))
-    words = ["ablate", str(tmp_path / "table_x"), "--scale", str(tmp_path / "smoke.yaml")]
-    return [*words, "--out", str(tmp_path / "out"), "--wandb", "off"]
+    return ["ablate", "table_x", "--scale", "smoke.yaml", "--out", "out", "--wandb", "off"]
 
 
 class TestRuns:

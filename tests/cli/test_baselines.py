@@ -9,7 +9,6 @@ import pytest
 import torch
 from tiny_baselines import FIRST_STAGES, SETTINGS, TINY, fit_words
 
-from lidarsim import simulate
 from lidarsim.scan_files import read_scan
 from r3dpa.baselines import BASELINES, baseline_of
 from r3dpa.baselines.lidm_networks import VQAutoencoder
@@ -22,7 +21,6 @@ from r3dpa.stages import scene_generator
 @pytest.fixture(scope="module", params=TINY)
 def trained(request, smoke_root, tmp_path_factory):
     """Stage and checkpoint of three steps."""
-    simulate(smoke_root, 12)
     run_dir, more = tmp_path_factory.mktemp(request.param), []
     if request.param in FIRST_STAGES:
         stage, _ = FIRST_STAGES[request.param]
@@ -170,7 +168,6 @@ def test_a_step_at_full_size(stage, smoke_root, tmp_path, caplog):
         content = Checkpoint(tmp_path, FIRST_STAGES[stage][0], first)
         path = save_checkpoint(content, tmp_path / "first.safetensors")
         more = [f"--model.init_args.init_from={path}"]
-    simulate(smoke_root, 12)
     names = ("num_scans", "batch_size", "num_workers")
     kept = {key: value for key, value in SETTINGS.items() if key.rpartition(".")[2] in names}
     kept |= {key: value for key, value in SETTINGS.items() if key.startswith("trainer.")}

@@ -4,15 +4,13 @@ Networks and images are tiny here; the slow tests start them at their own sizes.
 """
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import torch
 import yaml
+from fault_commands import Command
 
-from lidarsim import simulate
 from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint
 from r3dpa.cli import main
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
@@ -110,10 +108,9 @@ def start(tmp_path, caplog):
         words += [f"--{key}={value}" for key, value in (QUIET | settings).items()]
         main(["fit", *words, f"--run_dir={tmp_path / 'run'}"])
         assert "`Trainer.fit` stopped: `max_steps=1` reached" in caplog.text
-        weights = [
-            p for p in (tmp_path / "run").rglob("*") if p.suffix in (".ckpt", ".safetensors")
-        ]
-        assert not weights  # a trial must not look like a run, nor replace one
+        kinds = (".ckpt", ".safetensors", ".rows")  # the last of cached latents
+        written = [path for path in (tmp_path / "run").rglob("*") if path.suffix in kinds]
+        assert not written  # a trial must not look like a run, nor replace one
 
     return start
 
@@ -146,7 +143,6 @@ def net(name):
 @pytest.mark.parametrize(("experiment", "data"), STARTS.items())
 def test_experiments_with_tiny_networks(experiment, data, start, smoke_root, tmp_path):
     """Each with other data, all of which are the scans of the smoke size here."""
-    simulate(smoke_root, 12)  # unless they are there
     folder, stage = experiment.split("/")
     configs = ["trainer", f"data/{data}", f"experiment/{stage}"]
     if folder == "demo":
@@ -178,27 +174,32 @@ def test_experiments_with_tiny_networks(experiment, data, start, smoke_root, tmp
     start(configs, settings)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [name if name == "demo" else pytest.param(name, marks=pytest.mark.slow) for name in R3DPA_S],
-)
-def test_r3dpa_s_and_its_demo_start(name, start, smoke_root, tmp_path):
-    simulate(smoke_root, 12)  # unless they are there
-    given = R3DPA_S[name]
+def small_r3dpa_s(edition, grid_size):
+    """Arguments of the networks of an edition for images of 16 x 64, and settings of these."""
     vae, sit = (
-        yaml.safe_load((CONF / f"r3dpa_s/{part}.yaml").read_text())["init_args"]
+        yaml.safe_load((CONF / edition / f"{part}.yaml").read_text())["init_args"]
         for part in ("vae", "sit")
     )
     sit["input_size"] = [2, 4]
     settings = {
         "data.init_args.sensor": "{beams: 16, columns: 64}",
-        "data.init_args.grid_size": "[2, 2]",
+        "data.init_args.grid_size": grid_size,
         "model.init_args.sit.init_args.input_size": "[2, 4]",
     }
+    return vae, sit, settings
+
+
+@pytest.mark.parametrize(
+    "name",
+    [name if name == "demo" else pytest.param(name, marks=pytest.mark.slow) for name in R3DPA_S],
+)
+def test_r3dpa_s_and_its_demo_start(name, start, smoke_root, tmp_path):
+    given = R3DPA_S[name]
+    vae, sit, settings = small_r3dpa_s("r3dpa_s", "[2, 2]")
     if "demo_folder" in given:
         settings["data.init_args.scans"] = smoke_root
     else:
-        settings |= {"data.init_args.root": tmp_path / "data"} | SIMULATED
+        settings |= {"data.init_args.root": tmp_path / "data", "data.init_args.num_scans": 4}
     if name != "trained":
         codec = RangeCodec("log2", return_channel=True)
         exported = None if name == "flow" else sit
@@ -212,18 +213,8 @@ def test_r3dpa_s_and_its_demo_start(name, start, smoke_root, tmp_path):
     [n if n == "joint" else pytest.param(n, marks=pytest.mark.slow) for n in R3DPA_S_2],
 )
 def test_the_second_edition_of_r3dpa_s_starts(name, start, tmp_path):
-    vae, sit = (
-        yaml.safe_load((CONF / f"r3dpa_s_2/{part}.yaml").read_text())["init_args"]
-        for part in ("vae", "sit")
-    )
-    sit["input_size"] = [2, 4]
-    settings = {
-        "data.init_args.sensor": "{beams: 16, columns: 64}",
-        "data.init_args.grid_size": "[1, 4]",
-        "model.init_args.sit.init_args.input_size": "[2, 4]",
-        "data.init_args.root": tmp_path / "data",
-        "data.init_args.num_scans": 4,
-    }
+    vae, sit, settings = small_r3dpa_s("r3dpa_s_2", "[1, 4]")
+    settings |= {"data.init_args.root": tmp_path / "data", "data.init_args.num_scans": 4}
     if "teacher" in R3DPA_S_2[name]:
         settings["data.init_args.extractor"] = (
             f"{{class_path: {GEOMETRIC}, init_args: {{dim: 128}}}}"
@@ -245,8 +236,9 @@ def test_few_steps_keep_the_arguments_of_the_sit_of_the_flow(tmp_path):
     overlay.write_text(yaml.safe_dump({"model": model}))
     names = ("trainer", "r3dpa_s/data", "r3dpa_s/flow_matching")
     configs = [f"--config={path}" for path in (*(CONF / f"{n}.yaml" for n in names), overlay)]
-    command = [sys.executable, "-m", "r3dpa", "fit", *configs, "--print_config"]
-    printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    command = Command(tmp_path / "log", ["fit", *configs, "--print_config"])
+    status, printed = command.end()
+    assert status == 0, printed
     network = yaml.safe_load(printed)["model"]["init_args"]["sit"]
     expected = yaml.safe_load((CONF / "r3dpa_s/sit.yaml").read_text())["init_args"]
     assert network["class_path"] == sit["class_path"]

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from r3dpa.cli import COMMANDS, OWN_PARSER, _find, main
+from r3dpa.cli import ALIASES, COMMANDS, GROUPS, OWN_PARSER, main
 from r3dpa.cli.features import features_parser, with_data_class
 from r3dpa.cli.parser import load, make_parser, parse
 
@@ -37,6 +37,15 @@ def commands_in(text):
             words = shlex.split(found[1].partition(" > ")[0], comments=True)
             if "..." not in words and not any("|" in word for word in words):
                 yield words
+
+
+def split_command(words):
+    """Full name of a command, which must exist, and the words after it."""
+    length = 2 if words[0] in GROUPS else 1
+    name = " ".join(words[:length])
+    name = ALIASES.get(name, name)
+    assert name in COMMANDS
+    return name, words[length:]
 
 
 def documents():
@@ -96,17 +105,20 @@ def documented():
     for path in sorted(CONF.rglob("*.yaml")):
         lines = [line for line in path.open() if re.match(r"#\s{2,}(r3dpa|--)", line)]
         found[str(path.relative_to(TOP))] = "".join(line.lstrip("# ") for line in lines)
+    seen = []
     for name, text in found.items():
         for number, words in enumerate(commands_in(text)):
             if name.startswith("make my-sensor") and words[0] == "fit":
                 continue  # takes files of `data plan`: tests/data/test_sensor_plan.py
-            yield pytest.param(words, id=f"{name}-{number}-{words[0]}")
+            if words not in seen:
+                seen.append(words)
+                yield pytest.param(words, id=f"{name}-{number}-{words[0]}")
 
 
 @pytest.mark.parametrize("words", list(documented()))
 def test_command_is_accepted(words, monkeypatch, capsys):
     monkeypatch.chdir(TOP)
-    name, rest = _find(words)
+    name, rest = split_command(words)
     if name == "data features":
         features_parser(name).parse_args(with_data_class(rest))
     elif COMMANDS[name].target in OWN_PARSER:
@@ -158,7 +170,7 @@ def test_a_span_without_options_names_a_command():
         for span in spans_of(text, "r3dpa"):
             words = span.split()[1:]
             if words[0] not in {"COMMAND", "--help"} and words not in [[group] for group in groups]:
-                _find(words)
+                split_command(words)
 
 
 def test_abridged_spans_have_options_of_their_commands():
@@ -167,7 +179,7 @@ def test_abridged_spans_have_options_of_their_commands():
     abridged = [span for span in spans if " --" in span and re.search(r"\.\.\.|\|", span)]
     assert abridged
     for span in abridged:
-        name, words = _find(shlex.split(span)[1:])
+        name, words = split_command(shlex.split(span)[1:])
         actions = make_parser(load(COMMANDS[name].target))._actions
         options = {option for action in actions for option in action.option_strings}
         assert {word for word in words if word.startswith("--")} <= options, span
@@ -194,7 +206,7 @@ def test_a_missing_variable_of_the_makefile_fails(tmp_path):
 
 
 def test_readme_shows_every_group():
-    shown = {_find(words)[0] for words in commands_in((TOP / "README.md").read_text())}
+    shown = {split_command(words)[0] for words in commands_in((TOP / "README.md").read_text())}
     assert {"fit", "sample", "test", "evaluate", "ablate", "convert"} <= shown
     assert {name.split()[0] for name in shown} >= {"data", "edit", "bench"}
 

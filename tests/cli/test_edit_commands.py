@@ -1,6 +1,7 @@
 """``r3dpa edit``: files that its commands write, and what they refuse before networks run."""
 
 import json
+import multiprocessing
 
 import numpy as np
 import pytest
@@ -146,6 +147,13 @@ class TestFiles:
         assert not (tmp_path / "i" / "mask.png").exists()
 
 
+@pytest.fixture
+def forked_workers(monkeypatch, one_thread):
+    """Workers that need not import torch; they are spawned in test_simulation_drives.py."""
+    fork = multiprocessing.get_context("fork")
+    monkeypatch.setattr("lidarsim.io.multiprocessing.get_context", lambda _: fork)
+
+
 def missing_of(out):
     return torch.from_numpy(np.asarray(Image.open(out / "mask.png")) > 0)
 
@@ -207,6 +215,7 @@ class TestComplete:
             assert np.array_equal(written[: len(rows)], labels)
             assert not written[len(rows) :].any()
 
+    @pytest.mark.usefixtures("forked_workers")
     def test_a_folder_is_completed_alike_by_any_number_of_workers(self, files, tmp_path):
         for drive, name in (("x", "a"), ("y", "b"), ("y", "a")):
             write_bin(tmp_path / "in" / drive / f"{name}.bin", read_scan(files / f"{name}.bin"))

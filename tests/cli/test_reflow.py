@@ -11,7 +11,6 @@ import pytest
 import torch
 from tiny_baselines import fit_words
 
-from lidarsim import simulate
 from r3dpa.baselines import ReflowPairs
 from r3dpa.baselines.reflow import clamp_to_sensor
 from r3dpa.checkpoints import read_checkpoint
@@ -28,7 +27,6 @@ SAMPLER = SamplerConfig("euler", 3)
 @pytest.fixture(scope="module")
 def flow(smoke_root, tmp_path_factory):
     """Checkpoint of a 1-rectified flow."""
-    simulate(smoke_root, 12)
     run_dir = tmp_path_factory.mktemp("flow")
     main(fit_words("fit", "r2flow", smoke_root, run_dir))
     return run_dir / "checkpoints" / "last.ckpt"

@@ -116,10 +116,6 @@ def test_presets_are_the_shipped_configurations(capsys, tmp_path, monkeypatch):
     assert config["model"]["init_args"]["sit"]["init_args"]["hidden_size"] == 192
     assert config["data"]["init_args"]["root"] == "runs/demo/data"
     assert (config["run_dir"], config["trainer"]["max_steps"]) == ("runs/demo/joint", 7)
-    with pytest.raises(
-        ValueError, match=r"unknown preset 'kitti' .did you mean kitti360.*; choose from .*kitti360"
-    ):
-        main(["fit", "joint", "--preset", "kitti"])
 
 
 def test_the_paper_is_kitti360_with_scalr_and_a_global_batch_of_32_on_4_gpus():
@@ -200,22 +196,28 @@ TEACHER = {
 }
 
 
-def trained_teacher(smoke_root, run_dir, *more):
+@pytest.fixture(scope="session")
+def roots(smoke_root, make_once):
+    """Roots of the scans and of the labelled images that teachers learn from."""
+    return {"points": smoke_root, "images": make_once("labelled_images", Path.mkdir)}
+
+
+def trained_teacher(roots, run_dir, *more):
     configs = ["trainer.yaml", "data/points.yaml", "experiment/waffleiron_s.yaml"]
     words = [f"--{key}={value}" for key, value in (TEACHER | SIMULATED).items()]
-    words += [f"--data.init_args.source.init_args.root={smoke_root}"]
+    words += [f"--data.init_args.source.init_args.root={roots['points']}"]
     return trained(configs, words, run_dir, *more)
 
 
-def trained_judge(smoke_root, run_dir, *more):
-    return trained_with_classes(smoke_root, run_dir, *more, experiment="waffleiron_judge")
+def trained_judge(roots, run_dir, *more):
+    return trained_with_classes(roots, run_dir, *more, experiment="waffleiron_judge")
 
 
-def trained_with_classes(smoke_root, run_dir, *more, experiment="waffleiron_s_2"):
+def trained_with_classes(roots, run_dir, *more, experiment="waffleiron_s_2"):
     configs = ["trainer.yaml", "r3dpa_s_2/trainer.yaml", "data/labelled_points.yaml"]
     configs.append(f"experiment/{experiment}.yaml")
     words = [f"--{key}={value}" for key, value in (TEACHER | SIMULATED).items()]
-    words += [f"--data.init_args.source.init_args.root={run_dir.parent / 'images'}"]
+    words += [f"--data.init_args.source.init_args.root={roots['images']}"]
     return trained(configs, words, run_dir, *more)
 
 
@@ -227,10 +229,10 @@ def trained(configs, settings, run_dir, *more):
 
 
 @pytest.mark.parametrize("train", [trained_teacher, trained_with_classes, trained_judge])
-def test_the_point_teacher_trains_resumes_exactly_and_gives_a_source(train, smoke_root, tmp_path):
-    whole = train(smoke_root, tmp_path / "whole")
+def test_the_point_teacher_trains_resumes_exactly_and_gives_a_source(train, roots, tmp_path):
+    whole = train(roots, tmp_path / "whole")
     middle = tmp_path / "whole" / "checkpoints" / "step=0000001.ckpt"
-    resumed = train(smoke_root, tmp_path / "rest", f"--ckpt_path={middle}")
+    resumed = train(roots, tmp_path / "rest", f"--ckpt_path={middle}")
     for key, value in whole.items():
         assert torch.equal(resumed[key], value), key
     (weights,) = (tmp_path / "rest").glob("*.safetensors")

@@ -117,7 +117,8 @@ def test_a_reference_knows_its_scans_from_others_of_their_names(reference, smoke
         data.setup("predict")
         return scene_scoring._stamp(data.all_set.scans)
 
-    shutil.copytree(smoke_root, tmp_path / "data")
+    unstable = shutil.ignore_patterns("feature_grids", ".*")  # other processes write these
+    shutil.copytree(smoke_root, tmp_path / "data", ignore=unstable)
     stored = ReferenceStatistics.load(reference).about["scans_sha256"]
     assert stored == stamp(smoke_root) == stamp(tmp_path / "data")
     scan = next((tmp_path / "data").rglob("velodyne_points/data/*.bin"))
@@ -206,14 +207,6 @@ def test_the_official_file_is_a_reference(words, tmp_path, capsys):
 def test_without_scenes_the_losses_alone_are_reported(words, tmp_path, capsys):
     main(words(tmp_path, *QUIET, "--scorer.num_scenes=0"))
     assert "test/range_error_m" in capsys.readouterr().out
-    assert not (tmp_path / "evaluation").exists()
-
-
-def test_a_stage_without_velocity_says_so(smoke_args, vae_checkpoint, tmp_path, caplog):
-    fixed = smoke_args("vae_alignment", tmp_path, "--ckpt_path", str(vae_checkpoint), *QUIET)
-    with caplog.at_level("INFO"):
-        main(["test", *fixed[1:]])
-    assert "stage vae_alignment has nothing to sample" in caplog.text
     assert not (tmp_path / "evaluation").exists()
 
 

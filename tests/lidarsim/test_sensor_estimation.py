@@ -36,9 +36,9 @@ def largest_difference_deg(estimated, columns):
 
 
 @pytest.mark.parametrize("name", ["hdl64e", "hdl32e", "os1_128"])
-def test_ten_scans_of_a_preset_give_the_preset(name):
+def test_a_few_scans_of_a_preset_give_the_preset(name):
     truth = load_sensor(name)
-    estimated = estimate(scans_of(name, 10))
+    estimated = estimate(scans_of(name, 5))
     sensor, lasers = estimated.sensor, truth.lasers
     assert sensor.shots == truth.shots
     assert sensor.num_beams == truth.num_beams

@@ -69,6 +69,12 @@ def whole_reference():
 
 
 @cache
+def large_reference(num_scans):
+    """Statistics of enough scans for a verdict."""
+    return reference_of(list(scenes(count=num_scans)), replace(PROTOCOL, num_samples=80))
+
+
+@cache
 def found(seed, count=40, noise=0.0, num_resamples=40):
     """Rows of these scenes against the reference of the module, computed once."""
     resampling = Resampling(num_resamples=num_resamples)
@@ -234,7 +240,7 @@ def test_floors_of_few_scenes_are_not_kept_for_more():
 
 
 def test_verdict_is_one_line_above_the_table():
-    large = reference_of(list(scenes(count=64)), replace(PROTOCOL, num_samples=80))
+    large = large_reference(64)
     near = evaluated(scenes(1), large).about["extra"]["verdict"]
     assert near.startswith("near the floor in JSD")
     noisy = evaluated(scenes(1, noise=12.0), large)
@@ -254,8 +260,7 @@ def test_verdict_is_one_line_above_the_table():
 )
 def test_verdict_needs_enough_scenes_and_scans(num_scenes, num_scans, start):
     """Four scenes are near every floor, whatever they look like."""
-    reference = reference_of(list(scenes(count=num_scans)), replace(PROTOCOL, num_samples=80))
-    run = evaluated(scenes(1, num_scenes), reference, allow_few=True)
+    run = evaluated(scenes(1, num_scenes), large_reference(num_scans), allow_few=True)
     assert run.about["extra"]["verdict"].startswith(start)
 
 

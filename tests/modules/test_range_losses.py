@@ -64,7 +64,7 @@ def range_module(modes, discriminator=None, train_encoder=True, labelled=False, 
 
 @pytest.mark.parametrize("modes", [1, 2])
 def test_ranges_and_returns_are_learned_without_discriminator(modes):
-    module = train(range_module(modes), RangeData(30))
+    module = train(range_module(modes), RangeData(12))
     assert set(module.parts[0]) == {"reconstruction", "returns", "kl"}
     for name in ("reconstruction", "returns"):
         assert module.parts[-1][name] < module.parts[0][name] - 0.01, name

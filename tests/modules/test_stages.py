@@ -107,9 +107,12 @@ def test_two_processes_equal_one_with_the_global_batch(stage, smoke_args, from_p
 @pytest.mark.parametrize(
     "command", [pytest.param("validate", marks=pytest.mark.slow), "test", "predict"]
 )
-def test_a_checkpoint_is_evaluated(command, smoke_args, vae_checkpoint, tmp_path, capsys):
+def test_a_checkpoint_is_evaluated(command, smoke_args, vae_checkpoint, tmp_path, capsys, caplog):
     arguments = smoke_args("vae_alignment", tmp_path, "--ckpt_path", str(vae_checkpoint))
-    main([command, *arguments[1:], "--trainer.logger=false"])
+    with caplog.at_level("INFO"):
+        main([command, *arguments[1:], "--trainer.logger=false"])
+    assert ("vae_alignment has nothing to sample" in caplog.text) == (command == "test")
+    assert not (tmp_path / "evaluation").exists()
     assert ("range_error_m" in capsys.readouterr().out) == (command != "predict")
     pictures = list((tmp_path / "pictures").glob(f"{command[:3]}*_reconstruction_*.png"))
     assert len(pictures) == (command != "predict")
@@ -117,13 +120,6 @@ def test_a_checkpoint_is_evaluated(command, smoke_args, vae_checkpoint, tmp_path
     assert len(written) == (12 if command == "predict" else 0)
     assert not (tmp_path / "config.yaml").exists()  # that of the training would be replaced
     assert all(len(read_scan(path)) > 0 for path in written)
-
-
-@pytest.fixture(scope="module")
-def joint_run(smoke_args, tmp_path_factory):
-    run_dir = tmp_path_factory.mktemp("joint")
-    main(smoke_args("joint", run_dir, *QUICK))
-    return run_dir
 
 
 def test_saved_config_names_what_ran(joint_run):

@@ -61,12 +61,6 @@ class TestCachedLatents:
         blocks = [key for key in plain if key.startswith("sit.blocks")]
         assert max((before[key] - plain[key]).abs().max() for key in blocks) > 1e-3
 
-    def test_a_fast_dev_run_writes_no_cache(self, smoke_args, vae_checkpoint, tmp_path):
-        more = [*QUICK, "--trainer.fast_dev_run=1"]
-        more += ["--model.init_args.init_from", str(vae_checkpoint)]
-        main(smoke_args("flow_matching", tmp_path, *more, "--model.init_args.cache_latents=true"))
-        assert not (tmp_path / "latents").exists()
-
     @pytest.mark.slow
     def test_cached_latents_are_not_rounded_in_mixed_precision(
         self, smoke_args, vae_checkpoint, tmp_path
