@@ -27,6 +27,7 @@ def save_bad_batch(
     draws = module.draw_path(len(next(iter(tensors.values()))), number)
     weights = asdict(module.weights)
     weights["adversarial_start"] -= module.global_step  # it is run again at step 0
+    weights["alignment_stop"] = 0 if module.alignment_ended else None
     content = {
         "stage": module.stage,
         "step": module.global_step,

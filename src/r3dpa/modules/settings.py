@@ -39,6 +39,10 @@ class LossWeights:
             keeps the spatial structure (iREPA).
         alignment_stop: First step without ``sit_alignment``, which helps early and may hold back
             later (HASTE); None: never.
+        alignment_release: Or end ``sit_alignment`` once its residual has stopped falling: when a
+            fast average is less than this share below a slow one (RARE); None: never.
+        alignment_decays: Decays of the two averages. The slow one should reach over a twelfth of
+            all steps, the fast one over enough to even out the noise of batches.
     """
 
     reconstruction: float = 1.0
@@ -57,6 +61,8 @@ class LossWeights:
     skip_empty_cells: bool = False
     centre_features: bool = False
     alignment_stop: int | None = None
+    alignment_release: float | None = None
+    alignment_decays: tuple[float, float] = (0.99, 0.999)
 
 
 @dataclass(frozen=True)

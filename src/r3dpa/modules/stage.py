@@ -22,6 +22,7 @@ from r3dpa.flow.interpolant import LINEAR, Interpolant, sample_time
 from r3dpa.flow.noise import random_generator
 from r3dpa.geometry import ScanGeometry
 from r3dpa.io import source_commit
+from r3dpa.modules.alignment_release import ResidualAverages
 from r3dpa.modules.settings import LossWeights, OptimizerConfig, TimeSampling
 from r3dpa.nn import VAE, ImageVAE, VelocityNetwork
 
@@ -92,6 +93,7 @@ class Stage(L.LightningModule, ABC):
         self.logged_losses: dict[str, Tensor] = {}
         self.grad_norms: dict[str, Tensor] | None = None  # of this step, if the guard has them
         self.step_skipped = False
+        self.residuals = ResidualAverages()
 
     @abstractmethod
     def trainable(self) -> dict[str, nn.Module]:
@@ -195,8 +197,7 @@ class Stage(L.LightningModule, ABC):
         """L_denoise + lambda2 L_align on normalised latents without gradient."""
         weights = self.weights
         trains_velocity = weights.denoising != 0
-        stopped = weights.alignment_stop is not None and self.global_step >= weights.alignment_stop
-        aligns = weights.sit_alignment != 0 and not stopped
+        aligns = weights.sit_alignment != 0 and not self.alignment_ended
         errors = self.flow_errors(
             self.sit, normalised, features, draws, velocity=trains_velocity, alignment=aligns
         )
@@ -209,6 +210,12 @@ class Stage(L.LightningModule, ABC):
         elif weights.sit_alignment != 0:
             parts["sit_alignment"] = zero_loss(self.sit.projector)
         return parts
+
+    @property
+    def alignment_ended(self) -> bool:
+        """Whether the alignment of the flow has been stopped or released."""
+        stop = self.weights.alignment_stop
+        return self.residuals.released or (stop is not None and self.global_step >= stop)
 
     def alignment_errors(self, projected: Tensor, features: Tensor | None) -> Tensor:
         """L_align ``(B,)`` of projected tokens and feature grids, both ``(B, N, D)``."""
@@ -270,6 +277,7 @@ class Stage(L.LightningModule, ABC):
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
         """Set the rate of the coming step, a function of its number alone."""
+        self._follow_residual()
         config = self.optimizer_config
         rate = config.rate(self.global_step, self.trainer.max_steps)
         relative = {
@@ -278,6 +286,17 @@ class Stage(L.LightningModule, ABC):
         }
         for group in optimizer.param_groups:
             group["lr"] = relative.get(group["name"], 1.0) * rate
+
+    def _follow_residual(self) -> None:
+        """Add the alignment residual of this step, a mean over the processes, to its averages."""
+        error = self.logged_losses.get("sit_alignment")
+        if error is None or self.step_skipped or self.alignment_ended:
+            return
+        within, decays = self.weights.alignment_release, self.weights.alignment_decays
+        if within is not None:
+            mean = cast(Tensor, self.trainer.strategy.reduce(error, reduce_op="mean"))
+            fall = self.residuals.update(1 + mean.item(), decays, within)
+            self.log("train/alignment_fall", fall)
 
     def configure_gradient_clipping(
         self,
@@ -325,6 +344,8 @@ class Stage(L.LightningModule, ABC):
             "version": __version__,
             "commit": source_commit(),
         }
+        if self.residuals.steps:
+            facts["alignment_residuals"] = asdict(self.residuals)
         if self.geometry is not None:
             facts["geometry"] = self.geometry.to_dict()
             facts["augmentation"] = None if self.augmentation is None else asdict(self.augmentation)
@@ -343,6 +364,7 @@ class Stage(L.LightningModule, ABC):
                 f"the checkpoint is of stage {facts.get('stage')!r}, this is {self.stage!r}; to "
                 "start a stage from another one, give model.init_from instead of ckpt_path"
             )
+        self.residuals = ResidualAverages(**facts.get("alignment_residuals", {}))
         for state in checkpoint.get("optimizer_states", []):
             for group in state["param_groups"]:
                 group.update(self.optimizer_config.adamw())
