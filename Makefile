@@ -46,7 +46,7 @@ FIT_FIRST := nice -n 19 $(BIN)/r3dpa fit --config conf/trainer.yaml --config con
 .DEFAULT_GOAL := help
 .PHONY: help install format lint types test test-lowest test-all test-numerics \
 	test-faults test-nodes fuzz notebooks demo my-sensor gallery r3dpa-s \
-	r3dpa-s-control r3dpa-s-first r3dpa-s-scores docs clean bench bench-training \
+	r3dpa-s-control r3dpa-s-rgb r3dpa-s-first r3dpa-s-scores docs clean bench bench-training \
 	bench-sampling bench-gpu ablations
 
 help: ## list the targets
@@ -185,6 +185,22 @@ r3dpa-s-control: $(READY) ## its control without alignment, latent noise and joi
 	$(FIT_SECOND) $(SECOND_DATA) --config conf/r3dpa_s_2/flow_matching.yaml \
 		--config conf/r3dpa_s_2/control_flow.yaml --run_dir $(SECOND)/control_flow \
 		--model.init_args.init_from $(SECOND)/control_vae/checkpoints/last.ckpt
+
+RGB_STAGE = OMP_NUM_THREADS=1 nice -n 19 $(BIN)/r3dpa fit --config conf/trainer.yaml \
+	--config conf/r3dpa_s_2/trainer.yaml --config conf/data/dead_leaves.yaml --ckpt_path last
+r3dpa-s-rgb: $(READY) ## VAE and flow from an RGB prior, in the hours of both without: after make r3dpa-s
+	$(RGB_STAGE) --config conf/experiment/image_vae.yaml --trainer.max_steps 500 \
+		--data.init_args.num_workers 0 --run_dir $(SECOND)/image_vae
+	$(RGB_STAGE) --config conf/experiment/rgb_pretraining.yaml \
+		--model.init_args.sit conf/r3dpa_s_2/sit.yaml --config conf/r3dpa_s_2/rgb_prior.yaml \
+		--run_dir $(SECOND)/rgb_prior --model.init_args.init_from $(SECOND)/image_vae/checkpoints/last.ckpt
+	$(FIT_SECOND) $(SECOND_ALIGNED) --config conf/r3dpa_s_2/vae_alignment.yaml \
+		--config conf/r3dpa_s_2/vae_rgb.yaml --run_dir $(SECOND)/rgb_vae \
+		--model.init_args.rgb_weights $(SECOND)/rgb_prior/checkpoints/last.ckpt
+	$(FIT_SECOND) $(SECOND_ALIGNED) --config conf/r3dpa_s_2/flow_matching.yaml --trainer.max_steps 8000 \
+		--run_dir $(SECOND)/rgb_flow --model.init_args.latents_dir $(SECOND)/rgb_latents \
+		--model.init_args.init_networks '[vae,sit,latent_norm]' \
+		--model.init_args.init_from $(SECOND)/rgb_vae/checkpoints/last.ckpt
 
 r3dpa-s-first: $(READY) ## train the shipped weights, the first edition: an hour of a GPU, days of two cores
 	$(FIT_FIRST) --config conf/r3dpa_s/vae_alignment.yaml --run_dir runs/r3dpa_s/vae

@@ -38,6 +38,17 @@ class TestTransfer:
         norm_there = source.network("latent_norm").state_dict
         assert torch.equal(norm.running_mean, norm_there["running_mean"])
 
+    def test_patches_of_two_rows_and_one_column_are_kept(self):
+        """As many tokens as patches of 2 x 2 give on square images."""
+        args = {**SIT_ARGS, "patch_size": [2, 1]}
+        sit = randomised(SiT(**args))
+        report = transfer_rgb(self.source(patch_size=[2, 1]), sit, LatentNorm(4), True)
+        assert set(self.results(report).values()) == {"kept"}
+        report = transfer_rgb(
+            self.source(patch_size=[2, 1], input_size=(8, 8)), sit, LatentNorm(4), True
+        )
+        assert self.results(report)["pos_embed"] == "resized"
+
     @pytest.mark.parametrize(
         ("changes", "expected"),
         [

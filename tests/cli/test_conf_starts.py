@@ -23,7 +23,7 @@ TINY_UNET |= {"channel_multipliers": [1, 2], "feature_dim": 16, "projector_dim":
 CONF = Path(__file__).resolve().parents[2] / "conf"
 ELSEWHERE = {  # by the test that starts them
     "test_rgb_stages": "data/dead_leaves data/images experiment/image_vae "
-    "experiment/rgb_pretraining demo/rgb_pretraining net/sd_vae",
+    "experiment/rgb_pretraining demo/rgb_pretraining net/sd_vae r3dpa_s_2/rgb_prior",
     "test_shipped_networks": "net/vae_h2p4d8 net/vae_h1p4d4 net/vae_h16d4 net/vae_h16p2d16",
     "test_stage_cli": "data/points experiment/waffleiron_s data/labelled_points "
     "experiment/waffleiron_s_2 experiment/waffleiron_judge",
@@ -55,6 +55,7 @@ R3DPA_S = {  # in the order given
 }
 R3DPA_S_2 = {
     "vae": ("vae_alignment",),
+    "vae_rgb": ("teacher", "vae_alignment", "vae_rgb"),
     "flow": ("teacher", "flow_matching"),
     "joint": ("teacher", "joint"),
     "few_step": ("teacher", "flow_matching", "few_step"),
@@ -219,9 +220,9 @@ def test_the_second_edition_of_r3dpa_s_starts(name, start, tmp_path):
         settings["data.init_args.extractor"] = (
             f"{{class_path: {GEOMETRIC}, init_args: {{dim: 128}}}}"
         )
-    if name == "vae":
+    if name.startswith("vae"):
         vae = {key: value for key, value in vae.items() if key not in ("intensity", "num_classes")}
-    channels = {} if name == "vae" else {"intensity_channel": True, "num_classes": 15}
+    channels = {} if name.startswith("vae") else {"intensity_channel": True, "num_classes": 15}
     codec = RangeCodec("log2", return_channel=True, **channels)
     settings |= start_flow(tmp_path, vae, (16, 64), sit, codec)
     files = ("trainer", "data", *R3DPA_S_2[name])

@@ -8,11 +8,11 @@ import torch
 import yaml
 from PIL import Image
 
-from r3dpa.checkpoints import read_checkpoint
+from r3dpa.checkpoints import read_checkpoint, transfer_rgb
 from r3dpa.cli import main
 from r3dpa.features import DINOv2
 from r3dpa.modules import LossWeights, RGBPretraining
-from r3dpa.nn import ImageVAE, SiT
+from r3dpa.nn import ImageVAE, LatentNorm, SiT
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 SIT = yaml.safe_load((CONF / "smoke.yaml").read_text())["model"]["init_args"]["sit"]["init_args"]
@@ -108,6 +108,22 @@ def test_vae_alignment_starts_from_an_rgb_model(rgb, smoke_args, tmp_path, caplo
         if key.startswith(kept) or key in fresh:
             assert torch.equal(state[f"sit.{key}"], value) != (key in fresh), key
     assert all(word in caplog.text for word in ("resized", "fresh", "kept"))
+
+
+def test_the_prior_of_r3dpa_s_has_the_blocks_of_its_sit(image_vae, tmp_path):
+    folder = CONF / "r3dpa_s_2"
+    configs = ("trainer", "r3dpa_s_2/trainer", "data/dead_leaves", "experiment/rgb_pretraining")
+    prior = {"model.init_args.sit": folder / "sit.yaml", "config": folder / "rgb_prior.yaml"}
+    start = {"model.init_args.init_from": image_vae}
+    size = {"model.init_args.sit.init_args.input_size": [8, 8]}
+    path = fit(tmp_path, configs, prior, LEAVES, VAE, size, steps(1), start)
+    sit = SiT(**yaml.safe_load((folder / "sit.yaml").read_text())["init_args"])
+    rows = transfer_rgb(read_checkpoint(path), sit, LatentNorm(8), keep_projector=True)
+    found = {row.group: row.result for row in rows}
+    assert found.pop("pos_embed") == "resized"
+    fresh = {"x_embedder", "final_layer.linear", "latent_norm"}
+    assert {group for group, result in found.items() if result == "fresh"} == fresh
+    assert {result for group, result in found.items() if group not in fresh} == {"kept"}
 
 
 def test_images_of_a_folder_are_aligned_with_a_teacher(image_vae, tmp_path):
