@@ -17,6 +17,7 @@ FeatureSpace = Literal[
     "fsvd",
     "fpvd",
     "fwid",
+    "fwid_judge",
     "fgeo",
     "frd",
     "frid_r2flow",

@@ -73,6 +73,7 @@ MAKE = (
         "gallery",
         "r3dpa-s",
         "r3dpa-s-control",
+        "r3dpa-s-rgb",
         "r3dpa-s-first",
         "bench-training",
         "bench-sampling",

@@ -4,10 +4,13 @@ import re
 import pytest
 import torch
 import yaml
+from torch import nn
 
 import r3dpa.cli.evaluate as command
 from lidarsim.scan_files import write_bin
 from r3dpa.cli import main
+from r3dpa.features import ScanGrid, WaffleIron
+from r3dpa.features.scalr import save_weights
 from r3dpa.geometry import LidarSensor, SphericalProjection, points_of
 from r3dpa.metrics.networks.minkowski import MinkowskiNet, official_name
 from r3dpa.metrics.reference import ReferenceStatistics
@@ -69,6 +72,27 @@ def no_figures(monkeypatch):
 
 def evaluate(*words):
     main(["evaluate", *map(str, words), "--device", "cpu"])
+
+
+def test_a_second_judge_has_rows_of_its_own(data, samples, tmp_path, no_figures):
+    """Whoever gives other weights than those of the reference is told."""
+    torch.manual_seed(0)
+    grid = ScanGrid((-8.0, -8.0, -4.0), (8.0, 8.0, 4.0), (1.0, 1.0, 1.0), 0.5, 4)
+    files = [tmp_path / name for name in ("judge.safetensors", "another.safetensors")]
+    for file in files:
+        save_weights(file, WaffleIron(8, 3, grid.cells), nn.BatchNorm1d(8), grid)
+    reference, out = tmp_path / "ref.safetensors", tmp_path / "out"
+    judge = {"fwid_judge": files[0]}
+    command.reference(data=data, out=reference, spaces=("fgeo", "fwid_judge"), ckpt=judge)
+    words = ["--samples", samples, "--reference", reference, "--allow_few", "--out", out]
+    evaluate(*words, "--ckpt.fwid_judge", files[0])
+    found = Evaluation.load(out / "evaluation.json")
+    names = {row.name for row in found.rows}
+    assert {"FGEO", "FWID_JUDGE", "FWID_JUDGE recall"} <= names
+    assert "FWID" not in names
+    assert found.about["backbones"]["FWID_JUDGE"]["weights"]
+    with pytest.raises(ValueError, match="fwid_judge"):
+        evaluate(*words, "--ckpt.fwid_judge", files[1])
 
 
 def test_samples_are_compared_with_a_reference(data, samples, tmp_path, capsys):

@@ -228,7 +228,8 @@ def test_official_files_become_spaces(tmp_path):
     ("name", "ckpt", "message"),
     [
         ("fid", None, "unknown feature space 'fid'; choose from frid, fld"),
-        ("frid", None, r"frid needs its official weights: give --ckpt\.frid FILE"),
+        ("frid", None, r"frid needs weights: give --ckpt\.frid FILE"),
+        ("fwid_judge", None, r"--ckpt\.fwid_judge FILE .*waffleiron_judge\.yaml"),
         ("fgeo", "x.ckpt", "fgeo has no weights: leave x.ckpt out"),
         ("fld", "x.ckpt", "x.ckpt: no such file"),
     ],

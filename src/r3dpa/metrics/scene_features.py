@@ -12,10 +12,12 @@ name             features                                 width  weights
 ``frid_lidm``    the same without standardised input      512    official file
 ``fpd``          last four layers of PointNet (R2DM)      1808   official file
 ``fwid``         tokens of ``waffleiron-s``, over points  128    in the package
+``fwid_judge``   the same of another WaffleIron           any    file of your own
 ``fgeo``         ``geometric``, mean over points          64     needs none
 ===============  =======================================  =====  ===============
 
-Distances in the last two have no published numbers.
+Distances in the last three have no published numbers. ``fwid_judge`` is for a network that taught
+no generator, such as the one of ``conf/experiment/waffleiron_judge.yaml``, beside ``fwid``.
 """
 
 from __future__ import annotations
@@ -43,6 +45,7 @@ from r3dpa.metrics.networks.rangevit import RangeViT, range_channels
 from r3dpa.metrics.networks.sparse import NUM_BINS, pool_voxels, voxelize
 from r3dpa.metrics.scene import DEFAULT, EvaluationScene, Protocol
 
+_FILES = {"fwid_judge": "as conf/experiment/waffleiron_judge.yaml writes it"}
 # Generated scenes have no intensity: all points get the mean of real scans.
 _INTENSITY = CENTRES[-1]
 
@@ -96,10 +99,12 @@ def scene_features(
         return point_extractor_space(name, None if ckpt is None else Path(ckpt), device)
     if ckpt is None:
         raise ValueError(
-            f"{name} needs its official weights: give --ckpt.{name} FILE (`r3dpa test`: "
-            f"--scorer.ckpt.{name} FILE), the model.ckpt of the release; without a file there are "
+            f"{name} needs weights: give --ckpt.{name} FILE (`r3dpa test`: --scorer.ckpt.{name} "
+            f"FILE), {_FILES.get(name, 'the model.ckpt of the release')}; without a file there are "
             f"{' and '.join(FREE_SPACES)}"
         )
+    if name == "fwid_judge":
+        return point_extractor_space(name, Path(ckpt), device)
     if name == "frid":
         return range_vit_space(RangeViT.from_checkpoint(ckpt, protocol.sensor).to(device))
     if name == "fld":
@@ -230,8 +235,8 @@ def voxel_space(network: MinkowskiNet, protocol: Protocol) -> SceneFeatures:
 
 def point_extractor_space(name: str, ckpt: Path | None, device: str) -> SceneFeatures:
     """FWID's and FGEO's features: means over points, without the lift to a higher dimension."""
-    extractor: Any = (WaffleIronS(ckpt) if name == "fwid" else GeometricFeatures()).to(device)
-    if name == "fwid":
+    extractor: Any = (GeometricFeatures() if name == "fgeo" else WaffleIronS(ckpt)).to(device)
+    if name != "fgeo":
         dim, layer = extractor.network.width, "normalised tokens, mean over points"
     else:
         dim, layer = extractor.basis.shape[1], "kernel features, mean over points"
