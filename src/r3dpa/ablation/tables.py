@@ -224,10 +224,18 @@ def _describe(table: Table, orders: Sequence[Order]) -> list[str]:
         low, high = (100 * end for end in order.interval)
         reverse = " (worse there)" if order.claim == "worse" else ""
         lines.setdefault(claim, []).append(
-            f"{order.metric}{reverse} {order.holds}, {100 * order.change:+.0f} % "
+            f"{order.metric}{reverse} {_answer(order)}, {100 * order.change:+.0f} % "
             f"[{low:+.0f}, {high:+.0f}]"
         )
     return [f"Paper: {claim}. Here: {'; '.join(results)}" for claim, results in lines.items()]
+
+
+def _answer(order: Order) -> str:
+    """Yes or no, or the largest difference that an interval with both inside leaves."""
+    if order.holds != "unclear":
+        return order.holds
+    low, high = order.interval
+    return f"no difference above {100 * max(-low, high):.0f} %"
 
 
 def _record(
