@@ -14,6 +14,7 @@ from tiny_stages import QUIET, SILENT, TinyData, stage_module, train
 from torch.utils.data import DataLoader
 
 from r3dpa.callbacks import RunCheckpoint
+from r3dpa.checkpoints.networks import FACTS
 from r3dpa.modules import LossWeights, OptimizerConfig
 from r3dpa.modules.alignment_release import ResidualAverages
 
@@ -81,7 +82,7 @@ def test_a_skipped_step_is_not_averaged():
 
 def fit(folder, steps, ckpt=None):
     module = stage_module("flow_matching", weights=WEIGHTS)
-    saver = RunCheckpoint(folder, save_last=True, every_n_train_steps=1)
+    saver = RunCheckpoint(folder, save_last=True, every_n_train_steps=100)
     more = {"max_steps": steps, "enable_checkpointing": True, "max_epochs": -1}
     train(module, same_batch(8), callbacks=[saver], ckpt_path=ckpt, **more)
     return module.residuals, torch.load(folder / "last.ckpt", weights_only=False)
@@ -90,7 +91,8 @@ def fit(folder, steps, ckpt=None):
 def test_a_resumed_run_ends_it_at_the_same_step(tmp_path):
     expected, whole = fit(tmp_path / "whole", 8)
     assert expected.released
-    for stop in (1, expected.steps - 1, expected.steps, 7):
+    assert whole["r3dpa"].keys() <= {*FACTS}  # all that readers of checkpoints know
+    for stop in (1, expected.steps):
         folder = tmp_path / str(stop)
         fit(folder, stop)
         found, resumed = fit(folder, 8, folder / "last.ckpt")

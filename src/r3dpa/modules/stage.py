@@ -344,13 +344,13 @@ class Stage(L.LightningModule, ABC):
             "version": __version__,
             "commit": source_commit(),
         }
-        if self.residuals.steps:
-            facts["alignment_residuals"] = asdict(self.residuals)
         if self.geometry is not None:
             facts["geometry"] = self.geometry.to_dict()
             facts["augmentation"] = None if self.augmentation is None else asdict(self.augmentation)
             facts["feature_source"] = self.feature_source
         checkpoint["r3dpa"] = facts
+        if self.residuals.steps:
+            checkpoint["alignment_residuals"] = asdict(self.residuals)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuse the checkpoint of another stage or of other range images, and keep its step.
@@ -364,7 +364,7 @@ class Stage(L.LightningModule, ABC):
                 f"the checkpoint is of stage {facts.get('stage')!r}, this is {self.stage!r}; to "
                 "start a stage from another one, give model.init_from instead of ckpt_path"
             )
-        self.residuals = ResidualAverages(**facts.get("alignment_residuals", {}))
+        self.residuals = ResidualAverages(**checkpoint.get("alignment_residuals", {}))
         for state in checkpoint.get("optimizer_states", []):
             for group in state["param_groups"]:
                 group.update(self.optimizer_config.adamw())
