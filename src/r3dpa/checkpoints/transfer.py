@@ -60,9 +60,9 @@ def transfer_rgb(
     theirs = _group_weights(rgb.state_dict, statistics.state_dict)
     ours = _group_weights(sit.state_dict(), latent_norm.state_dict())
     patch = rgb.arguments["patch_size"]
-    rows, columns = (patch, patch) if isinstance(patch, int) else patch
+    patch = (patch, patch) if isinstance(patch, int) else patch
     size = rgb.arguments["input_size"]
-    same_grid = (size[0] // rows, size[1] // columns) == sit.grid_size
+    same_grid = (size[0] // patch[0], size[1] // patch[1]) == sit.grid_size
     init_args = rgb.arguments | {"input_size": sit.input_size}
     rows: list[TransferRow] = []
     merged: dict[str, Tensor] = {}

@@ -110,8 +110,8 @@ def ablate(
     Args:
         tables: A table, such as ``conf/ablation/table_3`` (also found in the package), or a folder
             of tables: ``conf/ablation``.
-        scale: ``demo`` for CPU cores, ``small`` for half an hour of one GPU, ``paper``; or a YAML
-            file of that kind.
+        scale: ``demo`` for CPU cores, ``s`` for the data and the SiT of ``make r3dpa-s``,
+            ``small`` for half an hour of one GPU, ``paper``; or a YAML file of that kind.
         seeds: Train and test every row for each, such as ``0 1 2``.
         out: Folder for everything; default: ``runs/ablation/<scale>``.
         jobs: Trainings and tests at a time; they share the cores, and all use the first GPU.
