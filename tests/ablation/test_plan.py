@@ -1,5 +1,6 @@
 """Plans of ablations: what rows share, what a name depends on, and what is refused."""
 
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -134,3 +135,19 @@ def test_a_wrong_row_is_named(row, message, tmp_path):
     (tmp_path / "t.yaml").write_text(yaml.safe_dump(content))
     with pytest.raises(ValueError, match=message):
         plan_of("demo", tables=tmp_path / "t.yaml")
+
+
+def test_tables_of_r3dpa_s_share_trainings_and_prepare_cached_images(tmp_path, monkeypatch):
+    """Six VAEs, twelve flows and three joint trainings of three seeds, after one prior."""
+    monkeypatch.chdir(TABLES.parents[1])  # the scale names files of the checkout
+    scale = TABLES / "scale" / "s.yaml"
+    plans = [
+        make_plan(TABLES / name, scale, (0, 1, 2), tmp_path, resolved)
+        for name in ("table_2", "table_3")
+    ]
+    names = {stage.name for plan in plans for stage in plan.stages}
+    kinds = Counter(name.partition("-")[0] for name in names)
+    assert kinds.pop("image_vae") == kinds.pop("rgb_pretraining") == 1
+    assert kinds == {"vae_alignment": 6, "flow_matching": 12, "joint": 3}
+    jobs = plan_jobs(plans[0])
+    assert jobs[0].words == ["data", "prepare", "--config", str(tmp_path / "data.yaml")]
