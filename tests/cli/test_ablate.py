@@ -131,7 +131,10 @@ class TestRuns:
         assert processes.kinds() == {"features": 1, "reference": 1, "fit": 3, "test": 2}
         text = capsys.readouterr().out
         assert "A table. Scale smoke: Smoke. Seeds 0." in text
-        assert "Paper: row b better than row a. Here: JSD no difference above 14 %, +0 % [-14, +14]" in text
+        assert (
+            "Paper: row b better than row a. Here: JSD no difference above 14 %, +0 % [-14, +14]"
+            in text
+        )
         main(command)
         assert not processes.started
         assert "7 of 7 are done already" in capsys.readouterr().out

@@ -36,7 +36,7 @@ def reference(
         out: File to write, ``.safetensors``.
         spaces: Feature spaces: ``fwid`` and ``fgeo`` need no file; ``frid``, ``fld``, ``fsvd`` and
             ``fpvd``, and ``frd``, ``frid_r2flow``, ``frid_lidm`` and ``fpd`` of the baselines, need
-            the weights of the official networks, ``fwid_judge`` those of a WaffleIron of yours.
+            the weights of the official networks; ``fwid_judge`` needs a WaffleIron of yours.
         ckpt: Weights by space, such as ``--ckpt.frid model.ckpt``.
         split: Part of the data.
         limit: Maximum scans, evenly spaced.
