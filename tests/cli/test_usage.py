@@ -11,8 +11,8 @@ import yaml
 
 from r3dpa.cli import ALIASES, COMMANDS, OWN_PARSER, main
 from r3dpa.cli.class_arguments import class_arguments
-from r3dpa.cli.fit import _check_class_arguments
-from r3dpa.cli.messages import _argument_names
+from r3dpa.cli.fit import check_class_arguments
+from r3dpa.cli.messages import argument_names
 from r3dpa.cli.parser import load, make_parser
 from r3dpa.cli.presets import conf_folder, expand_preset, stage_files
 
@@ -114,23 +114,25 @@ def test_known_arguments_of_classes_are_left_to_the_parser():
     }
     assert {"r3dpa.data.SimulatedDataModule", "r3dpa.modules.JointAlignment"} <= classes
     for class_path in classes:
-        accepted = {name.partition(".")[0] for name in _argument_names(class_path)} - {"help"}
+        accepted = {name.partition(".")[0] for name in argument_names(class_path)} - {"help"}
         assert accepted <= set(class_arguments(class_path))
     assert not class_arguments("torch.nn.Linear")
 
 
-def test_the_class_of_the_data_is_the_last_one_that_is_named(tmp_path):
+def test_an_option_belongs_to_the_class_that_was_named_before_it(tmp_path):
     images = tmp_path / "images.yaml"
     images.write_text("data: {class_path: r3dpa.data.ImageDataModule}")
-    words = ["--config", str(images), "--data.init_args.grid_size", "3"]
+    of_images, of_scans = (
+        ["--data.init_args." + name, "3"] for name in ("image_size", "grid_size")
+    )
+    words = ["--config", str(images), *of_images]
+    check_class_arguments("fit", [*words, "-c", "conf/data/folder.yaml", *of_scans])
+    check_class_arguments("fit", [*words, "--data", "LidarDataModule", *of_scans])
+    check_class_arguments("fit", [*words, "--data", "my_package.LidarDataModule", *of_scans])
     with pytest.raises(SystemExit):
-        _check_class_arguments("fit", words)
-    folder = ["-c", "conf/data/folder.yaml", "--data.init_args.grid_size", "3"]
-    _check_class_arguments("fit", ["--config", str(images), *folder])
-    _check_class_arguments("fit", [*words, "--data", "LidarDataModule"])
-    _check_class_arguments("fit", [*words, "--data", "my_package.LidarDataModule"])
+        check_class_arguments("fit", [*words, *of_scans])
     images.write_text("data: {")  # reported by the parser, which names the file and the line
-    _check_class_arguments("fit", words)
+    check_class_arguments("fit", [*words, *of_scans])
 
 
 def test_fit_alone_names_stages_and_presets(answers):

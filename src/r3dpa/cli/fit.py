@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import NoReturn
@@ -65,7 +64,7 @@ _CHECKPOINT_OPTIONS = (
     "--model.init_args.init_from",
     "--model.init_args.rgb_weights",
 )
-_CLASS_KEYS = ("class_path", "init_args", "dict_kwargs", "help")  # beside arguments of a class
+_CLASS_KEYS = ("init_args", "dict_kwargs", "help")  # beside arguments of a class
 _CHECKPOINT_WORDS = ("last", "best", "hpc", "null")  # of --ckpt_path, beside files
 
 
@@ -88,7 +87,7 @@ def run(args: list[str]) -> None:
         sys.stderr.write(f"{overview}\n\n")
         _refuse(command, "give a stage, or --config FILE")
     expanded = expand_preset(words)  # refuses an unknown stage or preset
-    _check_class_arguments(command, expanded.words)
+    check_class_arguments(command, expanded.words)
     from r3dpa.cli.stages import run as run_stage
 
     run_stage(args)
@@ -173,32 +172,38 @@ def _check_trainer_option(command: str, option: str) -> None:
             _refuse(command, f"unknown option {option}{near}")
 
 
-def _check_class_arguments(command: str, words: list[str]) -> None:
-    """Refuse an option that names no argument of the class of the model or the data."""
-    for option, _ in _options(words):
+def check_class_arguments(command: str, words: list[str]) -> None:
+    """Refuse an option that names no argument of the class of the model or the data.
+
+    That is the class which the words before the option chose, as for the parser.
+    """
+    class_paths = {"model": "", "data": ""}
+    for option, value in _options(words):
         group, _, keys = option[2:].partition(".")
         name = keys.removeprefix("init_args.").partition(".")[0].rstrip("+")
-        if group in ("model", "data") and name not in ("", *_CLASS_KEYS):
-            known = class_arguments(_class_path(group, words))
+        if option == "--config" and value.endswith((".yaml", ".yml")):
+            class_paths |= _class_paths(shipped(value))
+        elif group in class_paths and name in ("", "class_path"):
+            class_paths[group] = value
+        elif group in class_paths and name not in _CLASS_KEYS:
+            known = class_arguments(class_paths[group])
             if known and name not in known:
                 _refuse(command, f"unknown option {option}{suggestion(name, known)}")
 
 
-def _class_path(group: str, words: list[str]) -> str:
-    """Class of the model or the data that the words choose last; empty if that is not plain."""
-    class_path = ""
-    for option, value in _options(words):
-        if option == "--config" and value.endswith((".yaml", ".yml")):
-            with suppress(yaml.YAMLError):  # which the parser reports
-                config = yaml.safe_load(shipped(value).read_text())
-                section = config.get(group) if isinstance(config, dict) else None
-                if isinstance(section, str):
-                    class_path = section
-                elif isinstance(section, dict):
-                    class_path = section.get("class_path", class_path)
-        elif option in (f"--{group}", f"--{group}.class_path"):
-            class_path = value
-    return class_path
+def _class_paths(path: Path) -> dict[str, str]:
+    """Classes of the model and the data in a YAML file, where it names them."""
+    try:
+        config = yaml.safe_load(path.read_text())
+    except yaml.YAMLError:  # which the parser reports
+        return {}
+    class_paths = {}
+    for group in ("model", "data"):
+        section = config.get(group) if isinstance(config, dict) else None
+        class_path = section.get("class_path") if isinstance(section, dict) else section
+        if isinstance(class_path, str):
+            class_paths[group] = class_path
+    return class_paths
 
 
 def _check_words(command: str, words: list[str]) -> None:

@@ -72,7 +72,7 @@ def describe_error(
     if reason.startswith("Option '"):
         name = _quoted(reason)
         place = "".join(f"{key}." for key in [*keys, *_init_args(owner)])
-        return f"unknown option --{place}{name}{suggestion(name, _argument_names(owner))}"
+        return f"unknown option --{place}{name}{suggestion(name, argument_names(owner))}"
     if not keys:
         return _plain(reason)
     named = [action for action in parser._actions if action.dest == keys[0]]
@@ -86,7 +86,7 @@ def _init_args(owner: str) -> list[str]:
     return ["init_args"] if owner and not is_dataclass(pydoc.locate(owner)) else []
 
 
-def _argument_names(owner: str) -> list[str]:
+def argument_names(owner: str) -> list[str]:
     """Arguments of a class and of its base classes."""
     parser = ArgumentParser(exit_on_error=False)
     cls = pydoc.locate(owner)
