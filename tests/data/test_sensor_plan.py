@@ -20,15 +20,27 @@ def scans(tmp_path_factory):
 
 @pytest.mark.parametrize(
     ("num", "expected"),
-    [(3, (1, 2, 2)), (4, (2, 2, 2)), (7, (5, 2, 4)), (30, (24, 6, 5)), (1000, (800, 200, 5))],
+    [
+        (1, (1, 0, 5)),
+        (2, (2, 0, 5)),
+        (3, (1, 2, 2)),
+        (4, (2, 2, 2)),
+        (7, (5, 2, 4)),
+        (30, (24, 6, 5)),
+        (1000, (800, 200, 5)),
+    ],
 )
-def test_every_fifth_scan_is_held_out_and_at_least_two(num, expected):
-    assert split_of(num, "scans") == Split(*expected)
+def test_every_fifth_scan_is_held_out_and_at_least_two_of_three(num, expected):
+    assert split_of(num) == Split(*expected)
 
 
-def test_too_few_scans_are_refused_with_the_number_needed():
-    with pytest.raises(ValueError, match="scans: holds 2 scans of at least 3"):
-        split_of(2, "scans")
+def test_in_place_of_too_few_scans_simulated_ones_are_held_out(scans, tmp_path):
+    plan = SensorPlan.of("vlp16", str(scans / "0.bin"), 0.1)
+    assert "1 to train on, too few to hold out: simulated scans take their place" in str(plan)
+    assert "they compare with simulated scans" in plan.more
+    data = plan.files(tmp_path)["data"]["data"]["init_args"]
+    assert (data["scans"], data["val_every"]) == (str(tmp_path / "simulated"), 5)
+    assert data["further_scans"] == str(scans / "0.bin")
 
 
 def test_plan_of_a_sensor_of_sixteen_beams(scans, tmp_path, capsys):

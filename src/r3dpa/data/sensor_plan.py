@@ -36,11 +36,20 @@ _MOST_CHECKED = 8  # scans, whose share of points in the image is measured
 
 
 class Split(NamedTuple):
-    """Number of scans to train on and held out, and the stride of the latter."""
+    """Number of scans to train on and held out, and the stride of the latter.
+
+    With none held out, simulated scans are, at the same stride.
+    """
 
     num_train: int
     num_held_out: int
     val_every: int
+
+    def __str__(self) -> str:
+        held_out = f"{self.num_held_out} held out"
+        if not self.num_held_out:
+            held_out = "too few to hold out: simulated scans take their place"
+        return f"scans: {self.num_train} to train on, {held_out}"
 
 
 @dataclass(frozen=True)
@@ -76,7 +85,7 @@ class SensorPlan:
         """Plan for the scans of a folder; simulates a few scans to measure the machine.
 
         Raises:
-            ValueError: If there are too few scans, or images cannot have so many columns.
+            ValueError: If images cannot have so many columns.
         """
         divisor = _LATENTS[1] * _STRIDE
         if columns % divisor:
@@ -85,7 +94,7 @@ class SensorPlan:
         projection = BeamProjection.for_networks(lidar, columns)
         module = LidarDataModule(scans, sensor=sensor, image_columns=columns, val_every=None)
         all_scans = module.split()[0]
-        split = split_of(len(all_scans), scans)
+        split = split_of(len(all_scans))
         seconds = _seconds_per_scan(lidar)
         fitting = int(60 * _SIMULATION_SHARE * minutes * workers / seconds)
         num_simulated = min(MOST_SIMULATED, max(FEWEST_SIMULATED, fitting))
@@ -110,16 +119,18 @@ class SensorPlan:
 
     def files(self, out: Path) -> dict[str, dict[str, Any]]:
         """YAML files by name: data, both stages, and the simulation below the folder ``out``."""
-        data = {
-            "scans": self.scans,
+        simulated = str(out / "simulated")
+        if self.split.num_held_out:
+            scans = {"scans": self.scans, "further_scans": simulated, "repeats": self.repeats}
+        else:
+            scans = {"scans": simulated, "further_scans": self.scans}
+        data = scans | {
             "sensor": self.sensor,
             "image_columns": self.projection.sensor.columns,
             "codec": {"encoding": "log2", "return_channel": True},
             "grid_size": list(_GRID),
             "extractor": None,
             "val_every": self.split.val_every,
-            "further_scans": str(out / "simulated"),
-            "repeats": self.repeats,
             "num_workers": self.workers,
         }
         return {
@@ -163,7 +174,7 @@ class SensorPlan:
         }
 
     def __str__(self) -> str:
-        sensor, split = self.projection.sensor, self.split
+        sensor = self.projection.sensor
         simulated = f"{self.num_simulated} scans to simulate, {self.seconds_per_scan:.2f} s each"
         if self.num_simulated < MOST_SIMULATED:
             simulated += f" on a core: {MOST_SIMULATED} would take longer than the time allows"
@@ -172,7 +183,7 @@ class SensorPlan:
             [
                 f"image: {sensor.beams} x {sensor.columns}, {reach}, one row per beam; "
                 f"it holds {self.kept:.1%} of the points of a scan",
-                f"scans: {split.num_train} to train on, {split.num_held_out} held out",
+                str(self.split),
                 simulated,
                 f"{self._steps_text}, fewer where the time ends before",
             ]
@@ -185,6 +196,7 @@ class SensorPlan:
     @property
     def more(self) -> str:
         """Text that says what an hour or a GPU improves."""
+        compared = f"{self.split.num_held_out} held-out" if self.split.num_held_out else "simulated"
         return (
             f"Planned for {self.minutes:g} minutes on two idle cores: {self.num_simulated} scans, "
             f"{self._steps_text}; a slower machine stops a stage before its last step.\n"
@@ -193,22 +205,14 @@ class SensorPlan:
             "A GPU takes the steps that r3dpa-s was trained with in about an hour: 5252 of 64 "
             "scans and 6790 of 256.\n"
             "More scans of your own, from other drives, make the scores after it more reliable: "
-            f"they compare with {self.split.num_held_out} held-out scans."
+            f"they compare with {compared} scans."
         )
 
 
-def split_of(num_scans: int, where: str) -> Split:
-    """Hold out every fifth scan, but at least two.
-
-    Raises:
-        ValueError: If that leaves none to train on.
-    """
+def split_of(num_scans: int) -> Split:
+    """Hold out every fifth scan, but at least two, and none of one or two scans."""
     if num_scans <= _FEWEST_HELD_OUT:
-        raise ValueError(
-            f"{where}: holds {num_scans} scans of at least {_FEWEST_HELD_OUT + 1}, since "
-            f"{_FEWEST_HELD_OUT} are held out to compare with; with fewer, give `r3dpa fit` the "
-            "sensor and simulated scans alone"
-        )
+        return Split(num_scans, 0, _HELD_OUT_SHARE)
     num_held_out = max(_FEWEST_HELD_OUT, num_scans // _HELD_OUT_SHARE)
     val_every = math.ceil(num_scans / num_held_out)
     num_held_out = len(range(0, num_scans, val_every))
