@@ -57,7 +57,7 @@ def test_recorded_tables_are_computed_again(name, tmp_path):
     write_table(plan, plan.tables[0], {})
     content = json.loads((tmp_path / f"{name}.json").read_text())
     for key in ("caption", "scale", "about", "rows", "orders"):
-        assert content[key] == stored[key], key
+        assert ten_digits(content[key]) == ten_digits(stored[key]), key
     old, new = ((folder / f"{name}.md").read_text() for folder in (RECORDED, tmp_path))
     lines = [line for line in old.splitlines() if "Paper: " in line or "Scale" in line]
     assert [line for line in lines if line not in new] == []
@@ -69,6 +69,11 @@ def test_recorded_tables_are_computed_again(name, tmp_path):
             keys = ("label", "metric", "value", "low", "high")
             means.append([[line[key] for key in keys] for line in csv.DictReader(file)])
     assert means[0] == means[1]
+
+
+def ten_digits(value):
+    """Value of a JSON file with its numbers as text: the last digits depend on SciPy's version."""
+    return json.loads(json.dumps(value), parse_float=lambda number: f"{float(number):.10g}")
 
 
 def recorded(name, out):

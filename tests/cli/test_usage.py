@@ -287,7 +287,7 @@ def test_a_fit_says_what_it_lacks_and_what_follows(fitted):
 def test_the_bar_of_a_fit_shows_losses_and_no_notices_remain(fitted):
     _, stdout, stderr = fitted
     assert "loss=" in stdout
-    assert "kl=" in stdout
+    assert "reconstruction=" in stdout
     assert "v_num" not in stdout
     notices = ("GPU available", "TPU", "Tip", "anonymous", "Seed set", "wandb sync", "sync_dist")
     assert not [notice for notice in notices if notice in stdout + stderr]

@@ -47,7 +47,7 @@ def test_points_labels_and_origins_have_their_types_and_ranges(street_scan):
     assert np.isfinite(points).all()
     intensity = points[:, 3]
     assert intensity.min() >= 0
-    assert intensity.max() <= 0.99
+    assert intensity.max() <= np.float32(0.99)
     np.testing.assert_allclose(intensity * 100, np.round(intensity * 100), atol=1e-4)
     assert set(np.unique(labels & 0xFFFF)) <= set(Semantic)
     assert set(np.unique(origins)) <= set(Origin)
