@@ -57,7 +57,7 @@ def test_recorded_tables_are_computed_again(name, tmp_path):
     write_table(plan, plan.tables[0], {})
     content = json.loads((tmp_path / f"{name}.json").read_text())
     for key in ("caption", "scale", "about", "rows", "orders"):
-        assert ten_digits(content[key]) == ten_digits(stored[key]), key
+        assert six_digits(content[key]) == six_digits(stored[key]), key
     old, new = ((folder / f"{name}.md").read_text() for folder in (RECORDED, tmp_path))
     lines = [line for line in old.splitlines() if "Paper: " in line or "Scale" in line]
     assert [line for line in lines if line not in new] == []
@@ -66,14 +66,19 @@ def test_recorded_tables_are_computed_again(name, tmp_path):
     means = []
     for folder in (RECORDED, tmp_path):
         with (folder / f"{name}.csv").open(newline="") as file:
-            keys = ("label", "metric", "value", "low", "high")
-            means.append([[line[key] for key in keys] for line in csv.DictReader(file)])
-    assert means[0] == means[1]
+            means.append(
+                [
+                    [line["label"], line["metric"]]
+                    + [float(line[key]) for key in ("value", "low", "high") if line[key]]
+                    for line in csv.DictReader(file)
+                ]
+            )
+    assert six_digits(means[0]) == six_digits(means[1])
 
 
-def ten_digits(value):
+def six_digits(value):
     """Value of a JSON file with its numbers as text: the last digits depend on SciPy's version."""
-    return json.loads(json.dumps(value), parse_float=lambda number: f"{float(number):.10g}")
+    return json.loads(json.dumps(value), parse_float=lambda number: f"{float(number):.6g}")
 
 
 def recorded(name, out):
