@@ -84,7 +84,7 @@ def _targets(source: Path, out: Path, suffix: str) -> dict[Path, Path]:
 
 def _refuse_existing(target: Path) -> None:
     if target.exists():
-        raise ScanError(f"{target}: exists: delete it, or give another folder")
+        raise ScanError(f"{target}: exists: delete it, or give another name")
 
 
 def _content(cloud: PointCloud, suffix: str, full_intensity: float | None) -> bytes:

@@ -47,7 +47,8 @@ def test_plan_of_a_sensor_of_sixteen_beams(scans, tmp_path, capsys):
     words = ["plan", "vlp16", "--scans", str(scans), "--out", str(tmp_path), "--minutes", "0.1"]
     main(["data", *words])
     shown = capsys.readouterr().out
-    assert "image: 16 x 1024, 0.5 to 100 m, one row per beam; it holds" in shown
+    assert "image: 16 x 1024, 0.5 to 100 m, one row per beam\n" in shown
+    assert "of the points of 4 scans within the range limits come back" in shown
     assert "2 to train on, 2 held out" in shown
     assert "2000 would take longer than the time allows" in shown
     simulated = yaml.safe_load((tmp_path / "simulate.yaml").read_text())

@@ -10,6 +10,7 @@ from r3dpa.geometry import (
     LidarSensor,
     RingProjection,
     SphericalProjection,
+    describe_share_kept,
     in_range,
     points_of,
     pool_cells,
@@ -385,3 +386,14 @@ def test_an_image_comes_back_from_its_points(sensor, seed):
     row, column = projection.pixel_of(whole)
     assert torch.equal(row, torch.arange(sensor.beams)[:, None].expand_as(row))
     assert torch.equal(column, torch.arange(sensor.columns).expand_as(column))
+
+
+def test_the_share_that_an_image_gives_back_is_a_mean_over_scans():
+    """Two points share a pixel, and one beyond the range limits does not count."""
+    ahead = torch.tensor([[10.0, 0.1, 0.1], [20.0, 0.2, 0.2]])
+    beyond = torch.tensor([[500.0, 0.0, 0.0]])
+    scans = [torch.cat([ahead, beyond]), ahead[:1]]
+    assert describe_share_kept(scans, SphericalProjection(SMALL)) == (
+        "75.0% of the points of 2 scans within the range limits come back from the range image "
+        "of 8 x 16"
+    )

@@ -83,8 +83,10 @@ def test_targets_that_cannot_be_written_are_refused_before_anything_is(folder, p
         convert(folder, out, "--to", "ply")
     assert not out.exists()
     (folder / "a/0.npy").unlink()
-    with pytest.raises(ScanError, match=r"0\.bin: exists: delete it, or give another folder"):
+    with pytest.raises(ScanError, match=r"0\.bin: exists: delete it, or give another name"):
         convert(folder, folder, "--to", "bin")
+    with pytest.raises(ScanError, match=r"1\.bin: exists: delete it, or give another name"):
+        convert(folder / "a/0.bin", folder / "b/1.bin")
     shuffled = np.random.default_rng(0).normal(0, 9, (500, 4)).astype("<f4")
     shuffled[:, 3] = 0
     shuffled.tofile(folder / "b/1.bin")

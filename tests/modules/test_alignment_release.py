@@ -141,3 +141,9 @@ def test_processes_decide_alike(tmp_path, one_thread):
     assert first == second
     assert alone["released"]
     assert first == pytest.approx(alone, rel=1e-5)
+
+
+@pytest.mark.parametrize("decays", [(0.999, 0.99), (0.9, 1.0), (-0.1, 0.5)])
+def test_averages_that_reach_over_no_number_of_steps_are_refused(decays):
+    with pytest.raises(ValueError, match="alignment_decays must be 0 or more and below 1"):
+        LossWeights(alignment_decays=decays)

@@ -210,7 +210,7 @@ def estimate_sensor(scans: Sequence[Any] | str | Path) -> SensorEstimate:
 
 
 def _notes_on_beams(beams: BeamFit) -> list[str]:
-    """What is odd about the lines of the beams."""
+    """Notes on points off their beams, and on optical centres that the ranges do not show."""
     notes = []
     smear_deg = float(np.degrees(np.median(np.abs(beams.residual))))
     if smear_deg > _SMEAR_DEG:
@@ -228,7 +228,7 @@ def _notes_on_beams(beams: BeamFit) -> list[str]:
 
 
 def _notes_on_columns(columns: ColumnFit, covered_deg: int) -> list[str]:
-    """What is odd about the azimuths, of which so many degrees hold points."""
+    """Notes on columns, turns, sectors and second returns; ``covered_deg`` degrees have points."""
     notes = []
     if columns.coherence < _COHERENT:
         notes.append("azimuths lie on no common steps: the columns follow from the mean step")

@@ -5,11 +5,13 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Sequence
+from functools import cache
 from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
 
 
+@cache
 def trainer_arguments() -> list[str]:
     """Arguments of Lightning's trainer."""
     package = find_spec("lightning")
@@ -18,6 +20,7 @@ def trainer_arguments() -> list[str]:
     return _arguments("Trainer", [Path(package.origin).parent / "pytorch/trainer/trainer.py"])
 
 
+@cache
 def class_arguments(class_path: str) -> list[str]:
     """Arguments of a class of this package, by its import path or name; none of other classes."""
     package, _, name = class_path.rpartition(".")

@@ -253,7 +253,8 @@ def plan(
 
     Args:
         sensor: Preset of ``r3dpa data sensors`` or YAML of ``r3dpa data sensor``.
-        scans: Folder of scans of that sensor; every fifth is held out, at least two.
+        scans: Folder of scans of that sensor; every fifth is held out, at least two. In place of
+            one or two scans, simulated ones are held out.
         out: Folder for the files, and for what the commands write.
         minutes: Time for simulation and training on two cores.
         columns: Columns of the range images, a multiple of 128.

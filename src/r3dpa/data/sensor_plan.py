@@ -17,8 +17,8 @@ import yaml
 from lidarsim import Simulator
 from lidarsim.sensors import SpinningLidar, load_sensor
 from r3dpa.data.datamodules import LidarDataModule
-from r3dpa.data.scans import Scan, evenly
-from r3dpa.geometry import BeamProjection, share_kept
+from r3dpa.data.scans import evenly
+from r3dpa.geometry import BeamProjection, describe_share_kept
 from r3dpa.io import write_text
 
 MOST_SIMULATED, FEWEST_SIMULATED = 2000, 32
@@ -32,7 +32,7 @@ _FEWEST_HELD_OUT, _HELD_OUT_SHARE = 2, 5  # of which a comparison consists; ever
 _USER_SHARE = 1 / 3  # of the training scans of an epoch
 _EVERY = 20  # simulated scans of a drive are 2 s apart
 _TIMED_SCANS = 3
-_MOST_CHECKED = 8  # scans, whose share of points in the image is measured
+_SCANS_TO_CHECK = 8  # of whose points the share in the image is printed
 
 
 class Split(NamedTuple):
@@ -61,7 +61,7 @@ class SensorPlan:
         scans: Folder of its scans.
         projection: Range images.
         split: Scans to train on and to compare with.
-        kept: Mean share of the points of the scans that the images hold.
+        kept: Line that says which share of the points the images give back.
         seconds_per_scan: Time to simulate a scan on one core.
         num_simulated: Scans to simulate.
         minutes: Time for everything.
@@ -72,7 +72,7 @@ class SensorPlan:
     scans: str
     projection: BeamProjection
     split: Split
-    kept: float
+    kept: str
     seconds_per_scan: float
     num_simulated: int
     minutes: float
@@ -98,7 +98,9 @@ class SensorPlan:
         seconds = _seconds_per_scan(lidar)
         fitting = int(60 * _SIMULATION_SHARE * minutes * workers / seconds)
         num_simulated = min(MOST_SIMULATED, max(FEWEST_SIMULATED, fitting))
-        kept = _mean_share_kept(evenly(all_scans, _MOST_CHECKED), projection)
+        checked = evenly(all_scans, _SCANS_TO_CHECK)
+        points = [torch.from_numpy(scan.read(projection.sensor)[:, :3]) for scan in checked]
+        kept = describe_share_kept(points, projection)
         return cls(sensor, scans, projection, split, kept, seconds, num_simulated, minutes, workers)
 
     @property
@@ -181,8 +183,8 @@ class SensorPlan:
         reach = f"{sensor.range_min_m:g} to {sensor.range_max_m:g} m"
         return "\n".join(
             [
-                f"image: {sensor.beams} x {sensor.columns}, {reach}, one row per beam; "
-                f"it holds {self.kept:.1%} of the points of a scan",
+                f"image: {sensor.beams} x {sensor.columns}, {reach}, one row per beam",
+                self.kept,
                 str(self.split),
                 simulated,
                 f"{self._steps_text}, fewer where the time ends before",
@@ -227,11 +229,3 @@ def _seconds_per_scan(lidar: SpinningLidar) -> float:
     for number in range(1, 1 + _TIMED_SCANS):
         simulator.scan(number * _EVERY)
     return (time.perf_counter() - started) / _TIMED_SCANS
-
-
-def _mean_share_kept(scans: list[Scan], projection: BeamProjection) -> float:
-    shares = []
-    for scan in scans:
-        points = torch.from_numpy(scan.read(projection.sensor)[:, :3])
-        shares.append(share_kept(points, projection))
-    return sum(shares) / len(shares)

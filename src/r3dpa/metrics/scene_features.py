@@ -45,7 +45,6 @@ from r3dpa.metrics.networks.rangevit import RangeViT, range_channels
 from r3dpa.metrics.networks.sparse import NUM_BINS, pool_voxels, voxelize
 from r3dpa.metrics.scene import DEFAULT, EvaluationScene, Protocol
 
-_FILES = {"fwid_judge": "as conf/experiment/waffleiron_judge.yaml writes it"}
 # Generated scenes have no intensity: all points get the mean of real scans.
 _INTENSITY = CENTRES[-1]
 
@@ -98,9 +97,12 @@ def scene_features(
     if name in FREE_SPACES:
         return point_extractor_space(name, None if ckpt is None else Path(ckpt), device)
     if ckpt is None:
+        origin = "the model.ckpt of the release"
+        if name == "fwid_judge":
+            origin = "as conf/experiment/waffleiron_judge.yaml writes it"
         raise ValueError(
             f"{name} needs weights: give --ckpt.{name} FILE (`r3dpa test`: --scorer.ckpt.{name} "
-            f"FILE), {_FILES.get(name, 'the model.ckpt of the release')}; without a file there are "
+            f"FILE), {origin}; without a file there are "
             f"{' and '.join(FREE_SPACES)}"
         )
     if name == "fwid_judge":

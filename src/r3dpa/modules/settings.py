@@ -43,6 +43,9 @@ class LossWeights:
             fast average is less than this share below a slow one (RARE); None: never.
         alignment_decays: Decays of the two averages. The slow one should reach over a twelfth of
             all steps, the fast one over enough to even out the noise of batches.
+
+    Raises:
+        ValueError: If ``alignment_decays`` are not 0 <= fast < slow < 1.
     """
 
     reconstruction: float = 1.0
@@ -63,6 +66,14 @@ class LossWeights:
     alignment_stop: int | None = None
     alignment_release: float | None = None
     alignment_decays: tuple[float, float] = (0.99, 0.999)
+
+    def __post_init__(self) -> None:
+        fast, slow = self.alignment_decays
+        if not 0 <= fast < slow < 1:
+            raise ValueError(
+                "alignment_decays must be 0 or more and below 1, the smaller one first, got "
+                f"{fast:g} and {slow:g}"
+            )
 
 
 @dataclass(frozen=True)
