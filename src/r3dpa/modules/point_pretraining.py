@@ -44,6 +44,7 @@ class PointPretraining(LightningModule):
     #: Feature source that the weights are for, and whether they are written in half precision.
     source: type[WaffleIronS] = WaffleIronS
     writes_half = False
+    geometry_weight = 1.0
     edges: Tensor
 
     def __init__(
@@ -77,11 +78,17 @@ class PointPretraining(LightningModule):
                 f"--model.init_args.network has cells {list(self.network.cells)}, but the grid of "
                 f"--data.init_args.prepare has {list(masking.grid.cells)}: make them equal"
             )
+        if self.geometry_weight and not masking.geometry:
+            raise ValueError(
+                f"geometry_weight {self.geometry_weight:g} needs the targets that "
+                "--data.init_args.prepare leaves out with geometry false: set it to true, or give "
+                "PointSegmentation geometry_weight 0"
+            )
         self.grid = masking.grid
 
     def on_train_start(self) -> None:
         """Measure the quantiles of the descriptors in some training scans, unless resumed."""
-        if not self.edges.isfinite().all():
+        if self.geometry_weight and not self.edges.isfinite().all():
             scans = cast(Any, self.trainer).datamodule.train_set
             chosen = evenly(range(len(scans)), _SCANS_TO_QUANTISE)
             values = torch.cat([scans[index].targets for index in chosen]).numpy()

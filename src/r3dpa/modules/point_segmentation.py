@@ -27,7 +27,8 @@ class PointSegmentation(PointPretraining):
     Args:
         network: Network to train, with the ``cells`` of the scans' grid.
         start: Weights file of ``WaffleIronS`` to start from, of the same sizes as ``network``.
-        geometry_weight: Weight of the loss of the masked geometry.
+        geometry_weight: Weight of the loss of the masked geometry. With 0 its targets are not
+            needed: give :class:`~r3dpa.features.Masking` ``geometry`` false.
         kwargs: Further arguments of :class:`PointPretraining`.
     """
 
@@ -43,6 +44,7 @@ class PointSegmentation(PointPretraining):
     ) -> None:
         super().__init__(network, **kwargs)
         self.geometry_weight = geometry_weight
+        self.head.requires_grad_(geometry_weight > 0)
         self.class_head = nn.Linear(network.width, NUM_CLASSES)
         if start is not None:
             state, trained, _ = read_weights(start)
@@ -53,9 +55,11 @@ class PointSegmentation(PointPretraining):
     def losses(self, scans: Sequence[MaskedScan]) -> dict[str, Tensor]:
         """Weighted sum, cross-entropy of the classes, and the losses of the geometry."""
         tokens = self.tokens_of(scans)
-        geometry = self.geometry_losses(tokens, scans)
         classes = torch.cat([_classes(masked) for masked in scans]).to(self.device)
         of_classes = class_loss(self.class_head(tokens), classes)
+        if not self.geometry_weight:
+            return {"loss": of_classes, "classes": of_classes}
+        geometry = self.geometry_losses(tokens, scans)
         total = of_classes + self.geometry_weight * geometry["loss"]
         return geometry | {"loss": total, "classes": of_classes}
 
