@@ -234,7 +234,8 @@ def test_the_point_teacher_trains_resumes_exactly_and_gives_a_source(train, root
     middle = tmp_path / "whole" / "checkpoints" / "step=0000001.ckpt"
     resumed = train(roots, tmp_path / "rest", f"--ckpt_path={middle}")
     for key, value in whole.items():
-        assert torch.equal(resumed[key], value), key
+        # Without targets of geometry, their quantiles stay NaN.
+        torch.testing.assert_close(resumed[key], value, rtol=0, atol=0, equal_nan=True, msg=key)
     (weights,) = (tmp_path / "rest").glob("*.safetensors")
     name = weights.stem.replace("_", "-")
     features = feature_source(name, weights, dim=16)(torch.rand(50, 4) * 10)
