@@ -184,7 +184,8 @@ class MaskedScan(NamedTuple):
 
     scan: PreparedScan
     hidden: Tensor  #: ``(M,)`` bool: kept points that the network must not see
-    #: ``(M, T)`` float32 descriptors of the kept points within the whole scan; T is 0 without
+    #: ``(M, T)`` float32 descriptors of the kept points within the whole scan; T is 0
+    #: where ``Masking`` leaves them out
     targets: Tensor
     classes: Tensor | None = None  #: ``(M,)`` int64 semantic classes, -1 where unknown
 

@@ -44,7 +44,7 @@ class PointPretraining(LightningModule):
     #: Feature source that the weights are for, and whether they are written in half precision.
     source: type[WaffleIronS] = WaffleIronS
     writes_half = False
-    geometry_weight = 1.0
+    geometry_weight = 1.0  #: of the loss of the masked geometry
     edges: Tensor
 
     def __init__(

@@ -44,7 +44,7 @@ class PointSegmentation(PointPretraining):
     ) -> None:
         super().__init__(network, **kwargs)
         self.geometry_weight = geometry_weight
-        self.head.requires_grad_(geometry_weight > 0)
+        self.head.requires_grad_(geometry_weight > 0)  # DDP wants a gradient of every parameter
         self.class_head = nn.Linear(network.width, NUM_CLASSES)
         if start is not None:
             state, trained, _ = read_weights(start)
@@ -53,7 +53,7 @@ class PointSegmentation(PointPretraining):
             self.norm.load_state_dict(norm)
 
     def losses(self, scans: Sequence[MaskedScan]) -> dict[str, Tensor]:
-        """Weighted sum, cross-entropy of the classes, and the losses of the geometry."""
+        """Weighted sum, cross-entropy of the classes, losses of the geometry where it counts."""
         tokens = self.tokens_of(scans)
         classes = torch.cat([_classes(masked) for masked in scans]).to(self.device)
         of_classes = class_loss(self.class_head(tokens), classes)
