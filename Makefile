@@ -167,8 +167,11 @@ r3dpa-s: $(READY) ## train the second edition of r3dpa-s: 20 hours of a core; st
 		--run_dir $(SECOND)/teacher
 	OMP_NUM_THREADS=1 nice -n 19 $(BIN)/r3dpa data prepare $(SECOND_ALIGNED)
 	$(FIT_SECOND) $(SECOND_DATA) --config conf/r3dpa_s_2/vae_alignment.yaml --run_dir $(SECOND)/vae
-	$(FIT_SECOND) $(SECOND_ALIGNED) --config conf/r3dpa_s_2/flow_matching.yaml --run_dir $(SECOND)/flow \
+	$(FIT_SECOND) $(SECOND_DATA) --config conf/r3dpa_s_2/vae_alignment.yaml \
+		--config conf/r3dpa_s_2/vae_decoder.yaml --run_dir $(SECOND)/decoder \
 		--model.init_args.init_from $(SECOND)/vae/checkpoints/last.ckpt
+	$(FIT_SECOND) $(SECOND_ALIGNED) --config conf/r3dpa_s_2/flow_matching.yaml --run_dir $(SECOND)/flow \
+		--model.init_args.init_from $(SECOND)/decoder/checkpoints/last.ckpt
 	$(FIT_SECOND) $(SECOND_ALIGNED) --config conf/r3dpa_s_2/joint.yaml --run_dir $(SECOND)/joint \
 		--model.init_args.init_from $(SECOND)/flow/checkpoints/last.ckpt
 	$(FIT_SECOND) $(SECOND_ALIGNED) --config conf/r3dpa_s_2/flow_matching.yaml \
@@ -181,7 +184,8 @@ r3dpa-s: $(READY) ## train the second edition of r3dpa-s: 20 hours of a core; st
 
 r3dpa-s-control: $(READY) ## its control without alignment, latent noise and joint stage: after make r3dpa-s
 	$(FIT_SECOND) $(SECOND_DATA) --config conf/r3dpa_s_2/vae_alignment.yaml \
-		--config conf/r3dpa_s_2/control_vae.yaml --run_dir $(SECOND)/control_vae
+		--config conf/r3dpa_s_2/vae_decoder.yaml --config conf/r3dpa_s_2/control_vae.yaml \
+		--run_dir $(SECOND)/control_vae --model.init_args.init_from $(SECOND)/vae/checkpoints/last.ckpt
 	$(FIT_SECOND) $(SECOND_DATA) --config conf/r3dpa_s_2/flow_matching.yaml \
 		--config conf/r3dpa_s_2/control_flow.yaml --run_dir $(SECOND)/control_flow \
 		--model.init_args.init_from $(SECOND)/control_vae/checkpoints/last.ckpt
@@ -197,9 +201,8 @@ r3dpa-s-rgb: $(READY) ## VAE and flow from an RGB prior, in the hours of both wi
 	$(FIT_SECOND) $(SECOND_ALIGNED) --config conf/r3dpa_s_2/vae_alignment.yaml \
 		--config conf/r3dpa_s_2/vae_rgb.yaml --run_dir $(SECOND)/rgb_vae \
 		--model.init_args.rgb_weights $(SECOND)/rgb_prior/checkpoints/last.ckpt
-	$(FIT_SECOND) $(SECOND_ALIGNED) --config conf/r3dpa_s_2/flow_matching.yaml --trainer.max_steps 8000 \
+	$(FIT_SECOND) $(SECOND_ALIGNED) --config conf/r3dpa_s_2/flow_matching.yaml --trainer.max_steps 5000 \
 		--run_dir $(SECOND)/rgb_flow --model.init_args.latents_dir $(SECOND)/rgb_latents \
-		--model.init_args.init_networks '[vae,sit,latent_norm]' \
 		--model.init_args.init_from $(SECOND)/rgb_vae/checkpoints/last.ckpt
 
 r3dpa-s-first: $(READY) ## train the shipped weights, the first edition: an hour of a GPU, days of two cores

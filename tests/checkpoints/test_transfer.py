@@ -1,6 +1,7 @@
 """Weights of an RGB model in a network for range images."""
 
 import copy
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,9 @@ from whole_checkpoint import EXACT, SIT_ARGS, randomised
 from r3dpa.checkpoints import (
     Checkpoint,
     NetworkState,
+    load_into,
     transfer_rgb,
+    with_projector_of,
 )
 from r3dpa.nn.latent_norm import LatentNorm
 from r3dpa.nn.sit import SiT
@@ -111,3 +114,41 @@ class TestTransfer:
         source = Checkpoint(Path("unet.ckpt"), "flow_matching", networks)
         with pytest.raises(ValueError, match=r"unet\.ckpt holds a UNet, but .* to a SiT"):
             transfer_rgb(source, SiT(**SIT_ARGS), LatentNorm(4), keep_projector=False)
+
+
+class TestProjectionHead:
+    """An aligned run starts from weights that were trained without features."""
+
+    def source(self, **facts):
+        networks = {"ema": NetworkState.of(randomised(SiT(**SIT_ARGS)), SIT_ARGS)}
+        return Checkpoint(Path("unaligned.safetensors"), "few_step", networks, **facts)
+
+    @pytest.mark.parametrize(
+        "changes",
+        [{"feature_dim": 5}, {"alignment_depth": 1}, {"projector": "conv"}],
+        ids=lambda changes: next(iter(changes)),
+    )
+    def test_is_that_of_the_run_where_the_other_does_not_fit(self, changes):
+        source = self.source()
+        sit = randomised(SiT(**SIT_ARGS | changes))
+        head = copy.deepcopy(sit.projector.state_dict())
+        load_into({"sit": sit}, with_projector_of(source, sit), "flow_matching")
+        torch.testing.assert_close(sit.projector.state_dict(), head, **EXACT)
+        for key, value in source.network("ema").state_dict.items():
+            if not key.startswith("projector."):
+                assert torch.equal(sit.state_dict()[key], value), key
+
+    def test_is_kept_where_it_fits(self):
+        source = self.source()
+        assert with_projector_of(source, SiT(**SIT_ARGS)).networks == source.networks
+
+    @pytest.mark.parametrize(
+        "facts", [{"feature_source": "scalr"}, {}], ids=["aligned", "official"]
+    )
+    def test_that_has_learned_is_refused(self, facts):
+        source = self.source(**facts)
+        if not facts:
+            source = replace(source, stage="official")
+        sit = SiT(**SIT_ARGS | {"feature_dim": 5})
+        with pytest.raises(ValueError, match="projector"):
+            load_into({"sit": sit}, with_projector_of(source, sit), "flow_matching")

@@ -56,10 +56,11 @@ R3DPA_S = {  # in the order given
 R3DPA_S_2 = {
     "vae": ("vae_alignment",),
     "vae_rgb": ("teacher", "vae_alignment", "vae_rgb"),
+    "decoder": ("vae_alignment", "vae_decoder"),
     "flow": ("teacher", "flow_matching"),
     "joint": ("teacher", "joint"),
     "few_step": ("teacher", "flow_matching", "few_step"),
-    "control_vae": ("vae_alignment", "control_vae"),
+    "control_vae": ("vae_alignment", "vae_decoder", "control_vae"),
     "control_flow": ("flow_matching", "control_flow"),
 }
 VELOCITIES = sorted(path.stem for kind in ("sit", "unet") for path in CONF.glob(f"net/{kind}_*"))
@@ -214,7 +215,7 @@ def test_r3dpa_s_and_its_demo_start(name, start, smoke_root, tmp_path):
     [n if n == "joint" else pytest.param(n, marks=pytest.mark.slow) for n in R3DPA_S_2],
 )
 def test_the_second_edition_of_r3dpa_s_starts(name, start, tmp_path):
-    vae, sit, settings = small_r3dpa_s("r3dpa_s_2", "[1, 4]")
+    vae, sit, settings = small_r3dpa_s("r3dpa_s_2", "[2, 2]")
     settings |= {"data.init_args.root": tmp_path / "data", "data.init_args.num_scans": 4}
     if "teacher" in R3DPA_S_2[name]:
         settings["data.init_args.extractor"] = (

@@ -8,6 +8,7 @@ from r3dpa.checkpoints.transfer import (
     transfer_rgb,
     vae_fingerprint,
     with_further_channels,
+    with_projector_of,
 )
 from r3dpa.io import weights_sha256
 
@@ -25,4 +26,5 @@ __all__ = [
     "vae_fingerprint",
     "weights_sha256",
     "with_further_channels",
+    "with_projector_of",
 ]

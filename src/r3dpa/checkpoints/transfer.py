@@ -21,6 +21,7 @@ Result = Literal["kept", "fresh", "resized", "truncated", "dropped"]
 # VAE, running statistics 100 to 900 steps apart differ by up to 0.031 (batch 4) or 0.014 (32).
 NORM_TOLERANCE = 0.05
 _NORM = "latent_norm."
+_PROJECTOR = "projector."
 
 
 class TransferRow(NamedTuple):
@@ -110,6 +111,29 @@ def with_further_channels(checkpoint: Checkpoint, vae: VAE) -> Checkpoint:
         channels = {"intensity_channel": vae.intensity, "num_classes": vae.num_classes}
         geometry = {**geometry, "codec": {**geometry["codec"], **channels}}
     return replace(checkpoint, networks=networks, geometry=geometry)
+
+
+def with_projector_of(checkpoint: Checkpoint, sit: SiT) -> Checkpoint:
+    """Checkpoint whose SiTs have the projection head of ``sit`` if theirs never learned and differ.
+
+    So a run that aligns may start from one that did not, although features of another width, a head
+    of another kind or after another block need other weights. Unchanged if the heads fit, if the
+    checkpoint was trained with 3D features, or if it is official.
+    """
+    if checkpoint.feature_source is not None or checkpoint.stage == "official":
+        return checkpoint
+    head = {k: v for k, v in sit.state_dict().items() if k.startswith(_PROJECTOR)}
+    networks = dict(checkpoint.networks)
+    for name, state in checkpoint.networks.items():
+        if not issubclass(state.kind, SiT):
+            continue
+        rest = {k: v for k, v in state.state_dict.items() if not k.startswith(_PROJECTOR)}
+        before = {k: v for k, v in state.state_dict.items() if k not in rest}
+        same_block = state.arguments["alignment_depth"] == sit.alignment_depth
+        if shapes_of(before) != shapes_of(head) or not same_block:
+            init_args = {**state.init_args, "alignment_depth": sit.alignment_depth}
+            networks[name] = replace(state, init_args=init_args, state_dict=rest | head)
+    return replace(checkpoint, networks=networks)
 
 
 def _transfer_result(

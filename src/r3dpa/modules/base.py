@@ -11,7 +11,13 @@ from lightning.pytorch.utilities import rank_zero_info
 from torch import Tensor
 
 from r3dpa import losses
-from r3dpa.checkpoints import Checkpoint, load_into, read_checkpoint, transfer_rgb
+from r3dpa.checkpoints import (
+    Checkpoint,
+    load_into,
+    read_checkpoint,
+    transfer_rgb,
+    with_projector_of,
+)
 from r3dpa.checkpoints.image_size import resize_to
 from r3dpa.checkpoints.transfer import TransferRow
 from r3dpa.data.datasets import LidarBatch
@@ -217,13 +223,15 @@ class GenerativeModule(Stage):
     def previous_networks(self, before: Checkpoint) -> Checkpoint:
         """Checkpoint of the stage before, with the networks that this stage has.
 
-        Average velocities of stage few_step are left out.
+        Average velocities of stage few_step are left out, and so are projection heads of a SiT that
+        was not aligned.
         """
         networks = {}
         for name, state in before.networks.items():
             flow = {k: v for k, v in state.state_dict.items() if not k.startswith("average.")}
             networks[name] = replace(state, state_dict=flow)
-        return replace(before, networks=networks)
+        before = replace(before, networks=networks)
+        return with_projector_of(before, self.sit) if isinstance(self.sit, SiT) else before
 
     # Training
 
