@@ -174,6 +174,37 @@ def test_two_processes_write_what_one_does(data, expected):
     assert "Warning" not in done.stderr
 
 
+def cached_images(root, codec):
+    """Data YAML of four simulated scans that are kept as images."""
+    arguments = {"root": str(root), "num_scans": 4, "sensor": {"beams": 16, "columns": 64}}
+    arguments |= {"codec": codec, "grid_size": [2, 8], "extractor": GEOMETRIC}
+    path = root.parent / f"{root.name}.yaml"
+    name = "r3dpa.data.SimulatedImageDataModule"
+    path.write_text(yaml.safe_dump({"data": {"class_path": name, "init_args": arguments}}))
+    return path
+
+
+def test_labelled_images_give_the_grids_that_a_training_would_make(tmp_path, capsys):
+    codec = {"encoding": "log2", "return_channel": True, "intensity_channel": True}
+    grids = []
+    for name in ("prepared", "extracted"):
+        config = cached_images(tmp_path / name, codec)
+        if name == "extracted":
+            features("--data", config, "--data.init_args.batch_size", 3)
+            assert "4 made, 0 kept" in capsys.readouterr().out
+        main(["prepare", "--config", str(config)])
+        (file,) = (tmp_path / name / "feature_grids").rglob("*.rows")
+        grids.append(file.read_bytes())
+    assert len(grids[0]) == 4 * ROW
+    assert grids[0] == grids[1]
+
+
+def test_images_of_ranges_alone_are_refused(tmp_path):
+    config = cached_images(tmp_path / "ranges", {"encoding": "log2", "return_channel": True})
+    with pytest.raises(ValueError, match="cached without their scans: use data prepare"):
+        features("--data", config)
+
+
 class TestNamedColumns:
     """Scans of six columns: ``--columns`` names them in every command that reads a data set."""
 

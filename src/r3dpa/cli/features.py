@@ -17,6 +17,7 @@ from lightning import Trainer
 from r3dpa.cli.presets import shipped
 from r3dpa.cli.stages import StageParser, ignore_harmless_notices
 from r3dpa.data.datamodules import LidarDataModule
+from r3dpa.data.datasets import CachedImages
 from r3dpa.data.feature_grids import features_lock, plan
 from r3dpa.data.range_images import SimulatedImageDataModule
 from r3dpa.data.scans import Scan
@@ -45,8 +46,11 @@ def features(args: list[str]) -> None:
             f"no feature extractor: give --extractor, one of {', '.join(SOURCES)}, or one in the "
             "data configuration (--data.init_args.extractor)"
         )
-    if isinstance(data, SimulatedImageDataModule):
-        raise ValueError("the images of this data are cached without their scans: use data prepare")
+    if isinstance(data, SimulatedImageDataModule) and not data.has_values:
+        raise ValueError(
+            "the ranges of this data are cached without their scans: use data prepare, or a codec "
+            "with channels of intensity or class"
+        )
     _extract(data, trainer, config.grid_sizes or [data.grid_size])
 
 
@@ -76,12 +80,13 @@ def _extract(data: LidarDataModule, trainer: Trainer, sizes: list[tuple[int, int
     folder = cast(Path, data.features_dir)
     projection: Projection | None = None
     scans: list[Scan] = []
+    images: CachedImages | None = None
     with ExitStack() as job:
         if trainer.is_global_zero:
             # Before Lightning starts the other processes, which would wait and time out.
             data.prepare_data()
             data.setup("predict")
-            projection = data.geometry.projection
+            projection, images = data.geometry.projection, data.images
             arguments = data.all_set.scans, extractor, projection, sizes, folder, trainer.precision
             if plan(*arguments).missing:  # complete grids may lie on a read-only disk
                 job.enter_context(features_lock(folder))
@@ -94,7 +99,9 @@ def _extract(data: LidarDataModule, trainer: Trainer, sizes: list[tuple[int, int
             )
             sys.stdout.flush()  # into a log file at once
         loading = {"batch_size": data.batch_size, "num_workers": data.num_workers}
-        extraction = FeatureExtraction(extractor, projection, sizes, folder, scans, **loading)
+        extraction = FeatureExtraction(
+            extractor, projection, sizes, folder, scans, images=images, **loading
+        )
         started = time.monotonic()
         try:
             trainer.predict(extraction, return_predictions=False)

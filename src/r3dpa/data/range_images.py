@@ -132,12 +132,12 @@ class SimulatedImageDataModule(SimulatedDataModule):
             grids = settings.store(self.features_dir)
         with only_writer(Path(self.root) / ".lock", f"simulates into {self.root}", wait=True):
             missing = set(self._store.missing(images))
-            if grids is not None and not self._with_values:
+            if grids is not None and not self.has_values:
                 missing |= set(grids.missing(images))
             if missing:
-                made_with = None if self._with_values else grids
+                made_with = None if self.has_values else grids
                 self._simulate(sorted(missing), projection, made_with)
-            if grids is not None and self._with_values:
+            if grids is not None and self.has_values:
                 self._write_grids(grids, grids.missing(images))
 
     @cached_property
@@ -157,7 +157,7 @@ class SimulatedImageDataModule(SimulatedDataModule):
         return self._store.row_bytes
 
     @property
-    def _with_values(self) -> bool:
+    def has_values(self) -> bool:
         """Whether intensity and class are cached beside the range."""
         return self.codec.intensity_channel or self.codec.num_classes > 0
 
@@ -172,7 +172,7 @@ class SimulatedImageDataModule(SimulatedDataModule):
             "projection": projection_to_dict(self._known_projection),
         }
         shape = (self.sensor.beams, self.sensor.columns)
-        if not self._with_values:
+        if not self.has_values:
             return tensor_cache(Path(self.root), "range_image", request, shape, "float16")
         request["classes"] = [list(semantic.labels) for semantic in SEMANTIC_CLASSES]
         return tensor_cache(Path(self.root), "labelled_image", request, (3, *shape), "uint8")
@@ -194,7 +194,7 @@ class SimulatedImageDataModule(SimulatedDataModule):
         }
         extractor = cast(Extractor, self.extractor)
         prepare = None if grids is None else extractor.prepare
-        dataset = _Simulated(items, simulators, projection, prepare, self._with_values)
+        dataset = _Simulated(items, simulators, projection, prepare, self.has_values)
         loader = plain_loader(dataset, _SCANS_PER_BATCH, self.num_workers, collate_fn=list)
         with ExitStack() as stack:
             images = stack.enter_context(self._store.writer())

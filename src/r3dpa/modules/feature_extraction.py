@@ -10,7 +10,7 @@ import torch
 from lightning.pytorch import LightningModule
 from torch.utils.data import DataLoader, DistributedSampler
 
-from r3dpa.data.datasets import PointDataset, PointSample
+from r3dpa.data.datasets import CachedImages, PointDataset, PointSample
 from r3dpa.data.feature_grids import Extractor, GridSettings, pooled_grids
 from r3dpa.data.loaders import plain_loader
 from r3dpa.data.scans import Scan
@@ -32,6 +32,8 @@ class FeatureExtraction(LightningModule):
         grid_sizes: Rows and columns (h, w) of the grids; all are pooled from one pass.
         features_dir: Folder of the grids of this extractor.
         scans: Scans to extract; only the list of the first process counts.
+        images: Cached images whose pixels are the points, in place of the files of the scans; only
+            those of the first process count.
         batch_size: Scans per batch and process.
         num_workers: Loader processes per process.
 
@@ -48,26 +50,27 @@ class FeatureExtraction(LightningModule):
         scans: Sequence[Scan],
         batch_size: int = 1,
         num_workers: int = 0,
+        images: CachedImages | None = None,
     ) -> None:
         super().__init__()
         self.allow_zero_length_dataloader_with_multiple_devices = True  # fewer scans than processes
         self.extractor: Extractor = extractor
-        self.projection, self.scans = projection, list(scans)
+        self.projection, self.scans, self.images = projection, list(scans), images
         self.grid_sizes = list(grid_sizes)
         self.features_dir = Path(features_dir)
         self.batch_size, self.num_workers = batch_size, num_workers
         self._writers: dict[tuple[int, int], StoreWriter] = {}
 
     def setup(self, stage: str) -> None:
-        """Take scans and projection of the first process: others may lack what is needed."""
-        given = self.projection, self.scans
-        self.projection, self.scans = self.trainer.strategy.broadcast(given)
+        """Take the scans of the first process: others may lack what is needed."""
+        given = self.projection, self.scans, self.images
+        self.projection, self.scans, self.images = self.trainer.strategy.broadcast(given)
 
     def predict_dataloader(self) -> DataLoader[Any]:
         """The share of this process, in order; no scan is given twice."""
         scans = self.scans[self.trainer.global_rank :: self.trainer.world_size]
         sensor = cast(Projection, self.projection).sensor
-        dataset = PointDataset(scans, sensor, self.extractor.prepare)
+        dataset = PointDataset(scans, sensor, self.extractor.prepare, self.images)
         # Of one process, so that Lightning does not divide the share once more.
         sampler: DistributedSampler[Any] = DistributedSampler(dataset, 1, 0, shuffle=False)
         return plain_loader(
