@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 
 import pytest
+import torch
 
 from r3dpa.bench.dry_run import batch_lines
 from r3dpa.cli import main
@@ -42,6 +43,24 @@ def test_a_dry_run_knows_the_size_of_images_before_they_exist(smoke_args, tmp_pa
     words += [f"--data.init_args.root={tmp_path / 'images'}"]
     main([*words, "--dry_run"])
     assert "disk: 12 scans, 24.6 kB\n" in capsys.readouterr().out  # in float16
+
+
+@pytest.mark.parametrize(
+    ("instructions", "accelerator", "precision"),
+    [
+        ("AVX2", "auto", "32-true"),
+        ("AVX2", "cpu", "bf16-mixed"),
+        ("AVX512", "auto", "bf16-mixed"),
+    ],
+)
+def test_a_processor_without_bfloat16_trains_in_float32(
+    instructions, accelerator, precision, smoke_args, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: instructions)
+    words = smoke_args("vae_alignment", tmp_path / "run", "--trainer.precision=bf16-mixed")
+    lines = dry_run([*words, f"--trainer.accelerator={accelerator}"], capsys)
+    assert f"thread, {precision}" in lines["measured"].replace("threads", "thread")
 
 
 @pytest.mark.parametrize(

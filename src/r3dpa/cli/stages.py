@@ -12,6 +12,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, cast
 
+import torch
 import yaml
 from lightning import LightningDataModule, LightningModule, Trainer
 from lightning.pytorch.callbacks import TQDMProgressBar
@@ -65,6 +66,10 @@ _WITHOUT_WEIGHTS = {
         "VAE and SiT start from random values; the paper starts from a checkpoint of vae_alignment",
     ),
 }
+
+
+# Instruction sets of processors, as torch names them, with which bfloat16 is computed one by one.
+_WITHOUT_BFLOAT16 = ("NO AVX", "DEFAULT", "AVX2")
 
 
 class StageParser(Parser, LightningArgumentParser):
@@ -299,8 +304,14 @@ class StageCLI(LightningCLI):
         return self.config[self.subcommand].ckpt_path
 
     def before_instantiate_classes(self) -> None:
-        """Point loggers at the run's folder; `test` and a resumed `fit` join the wandb run."""
+        """Choose the precision; point loggers at the run's folder, `test` at the wandb run too."""
         config = self.config[self.subcommand]
+        if config.trainer.precision == "bf16-mixed" and _runs_without_bfloat16(config.trainer):
+            rank_zero_info(
+                "this processor computes bfloat16 tens of times more slowly than float32: "
+                "precision 32-true (--trainer.accelerator cpu keeps bf16-mixed)"
+            )
+            config.trainer.precision = "32-true"
         if self.subcommand == "predict" and config.return_predictions is None:
             config.return_predictions = False  # they are on disk; all of KITTI-360 is 20 GB
         if self._dry_run:
@@ -332,6 +343,13 @@ class StageCLI(LightningCLI):
                 init_args[key] = value
         if init_args.get("offline"):  # nothing to look at on the web
             os.environ.setdefault("WANDB_SILENT", "true")
+
+
+def _runs_without_bfloat16(trainer: Any) -> bool:
+    """Whether accelerator ``auto`` finds no more than a processor without bfloat16."""
+    accelerated = torch.cuda.is_available() or torch.backends.mps.is_available()
+    capability = torch.backends.cpu.get_cpu_capability()
+    return trainer.accelerator == "auto" and not accelerated and capability in _WITHOUT_BFLOAT16
 
 
 def _newest(run_dir: Path) -> str | None:
