@@ -58,6 +58,7 @@ R3DPA_S_2 = {
     "vae_rgb": ("teacher", "vae_alignment", "vae_rgb"),
     "decoder": ("vae_alignment", "vae_decoder"),
     "flow": ("teacher", "flow_matching"),
+    "readout": ("teacher", "flow_matching", "readout"),
     "joint": ("teacher", "joint"),
     "few_step": ("teacher", "flow_matching", "few_step"),
     "control_vae": ("vae_alignment", "vae_decoder", "control_vae"),

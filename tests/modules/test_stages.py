@@ -65,6 +65,25 @@ def test_flow_matching_without_latent_statistics_is_refused(smoke_args, from_pre
         main(smoke_args("flow_matching", tmp_path, *more, "--model.init_args.init_networks=[vae]"))
 
 
+def test_a_readout_trains_the_projection_head_alone(
+    smoke_args, vae_checkpoint, from_previous, tmp_path
+):
+    more = [*QUICK, *from_previous("flow_matching"), "--model.init_args.train_blocks=false"]
+    more += ["--model.init_args.init_networks=[vae,sit,latent_norm]"]
+    more += ["--model.init_args.optimizer.lr=0.01"]
+    with pytest.raises(ValueError, match=r"needs weights\.sit_alignment"):
+        main(smoke_args("flow_matching", tmp_path / "nothing", *more))
+    weights = "--model.init_args.weights={denoising: 0.0, sit_alignment: 1.0}"
+    main(smoke_args("flow_matching", tmp_path / "run", *more, weights))
+    before = torch.load(vae_checkpoint, weights_only=True)["state_dict"]
+    after = load(tmp_path / "run")["state_dict"]
+    kept = [key for key in before if key in after]
+    assert any(key.startswith("sit.blocks.") for key in kept)
+    changed = {key for key in kept if not torch.equal(after[key], before[key])}
+    assert changed
+    assert all(key.startswith("sit.projector.") for key in changed)
+
+
 def test_joint_starts_from_the_stage_before(smoke_args, vae_checkpoint, from_previous, tmp_path):
     """At learning rate 0 the loaded weights are still there after a step."""
     still = ["--model.init_args.optimizer.lr", "0", *QUICK, "--trainer.max_steps=1"]

@@ -36,6 +36,9 @@ class FlowMatching(GenerativeModule):
             rounding, at a tenth of its cost. Scans may be rotated, but not mirrored.
         latents_dir: Folder of the cached posteriors, which several runs may share; default:
             ``<run_dir>/latents``.
+        train_blocks: False keeps the velocity network as it came and trains its projection head
+            alone: a readout, by whose features a flow that was never aligned can be guided (Luo et
+            al., "Readout Guidance: Learning Control from Diffusion Features", CVPR 2024).
         **kwargs: See :class:`GenerativeModule`. ``init_from`` is needed to fit; to continue from
             the VAE-alignment stage let ``init_networks`` name ``sit`` too.
     """
@@ -51,12 +54,19 @@ class FlowMatching(GenerativeModule):
         weights: LossWeights = LossWeights(sit_alignment=0.0),
         cache_latents: bool = False,
         latents_dir: str | None = None,
+        train_blocks: bool = True,
         **kwargs: Any,
     ) -> None:
         super().__init__(vae, sit, weights=weights, **kwargs)
+        if not train_blocks and weights.sit_alignment == 0:
+            raise ValueError(
+                "train_blocks: false trains the projection head alone, which needs "
+                "weights.sit_alignment: give it a weight, or train the blocks"
+            )
         self.cache_latents = cache_latents
         self.latents_dir = latents_dir
         self.vae.requires_grad_(False)
+        self.sit.requires_grad_(train_blocks)
         self.sit.projector.requires_grad_(self.weights.sit_alignment != 0)
 
     def needs_features(self) -> bool:

@@ -36,7 +36,7 @@ class LossWeights:
         sit_alignment: lambda2, weight of the alignment loss that reaches the SiT.
         skip_empty_cells: Leave empty grid cells out of the mean of the alignment loss.
         centre_features: Align with the difference of each cell from the mean of its scan, which
-            keeps the spatial structure (iREPA).
+            keeps the spatial structure (iREPA). Edits guide by features as they are, not centred.
         alignment_stop: First step without ``sit_alignment``, which helps early and may hold back
             later (HASTE); None: never.
         alignment_release: Or end ``sit_alignment`` once its residual has stopped falling: when a
