@@ -54,11 +54,12 @@ def range_module(modes, discriminator=None, train_encoder=True, labelled=False, 
     torch.manual_seed(0)
     further = {"intensity": True, "num_classes": NUM_CLASSES} if labelled else {}
     vae = VAE(2, 4, 32, (1,), (), 1, stem=(2, 2), modes=modes, **further)
-    latent_noise = kwargs.pop("latent_noise", 0.0)
+    settings = {
+        name: kwargs.pop(name) for name in {"latent_noise", "init_networks"} & kwargs.keys()
+    }
     weights = LossWeights(vae_alignment=0.0, **kwargs)
-    settings = {"weights": weights, "optimizer": OptimizerConfig(lr=3e-3)}
+    settings |= {"weights": weights, "optimizer": OptimizerConfig(lr=3e-3)}
     settings |= {"discriminator": discriminator, "train_encoder": train_encoder}
-    settings |= {"latent_noise": latent_noise}
     return STAGES["vae_alignment"](vae=vae, sit=tiny_sit(), **settings)
 
 
@@ -164,6 +165,14 @@ def test_a_decoder_is_trained_on_for_the_latents_of_a_fixed_encoder():
         n for n, value in module.vae.state_dict().items() if not torch.equal(value, before[n])
     }
     assert changed == {n for n in before if n.startswith(("decoder.", "post_quant_conv."))}
+
+
+@pytest.mark.parametrize("taken_over", [["vae"], ["vae", "latent_norm"]], ids="+".join)
+def test_statistics_of_a_fixed_encoder_that_were_taken_over_stay(taken_over):
+    """Else a flow that was trained with them would see shifted latents."""
+    module = range_module(2, train_encoder=False, init_networks=taken_over)
+    train(module, RangeData(2))
+    assert module.latent_norm.num_batches_tracked == (0 if "latent_norm" in taken_over else 2)
 
 
 @pytest.mark.parametrize("modes", [1, 2])

@@ -30,7 +30,7 @@ class VAEAlignment(GenerativeModule):
         sit: Velocity network, frozen but for projector and input layer (patch embedding).
         discriminator: Patch discriminator; without it, no adversarial term.
         train_encoder: False freezes the encoder, so that an existing flow stays valid, and
-            fine-tunes the decoder.
+            fine-tunes the decoder. Latent statistics that ``init_networks`` takes over stay too.
         train_patch_embed: Train the patch embedding (paper); False freezes it (official code).
         keep_projector: Keep the RGB model's projection head where its shape fits, as officially.
         **kwargs: See :class:`GenerativeModule`.
@@ -53,6 +53,7 @@ class VAEAlignment(GenerativeModule):
         super().__init__(vae, sit, discriminator, keep_projector=keep_projector, **kwargs)
         for part in (self.vae.encoder, self.vae.quant_conv):
             part.requires_grad_(train_encoder)
+        self.keeps_statistics = not train_encoder and "latent_norm" in self.init_networks
         self.sit.requires_grad_(False)
         if self.weights.vae_alignment != 0:
             self.sit.projector.requires_grad_(True)
@@ -86,5 +87,6 @@ class VAEAlignment(GenerativeModule):
         losses = self.vae_losses(image, posterior, prediction)
         losses |= self.vae_alignment_losses(latents, features, draws)
         losses |= self.discriminator_losses(image, prediction)
-        self.latent_norm.update(latents.detach())
+        if not self.keeps_statistics:
+            self.latent_norm.update(latents.detach())
         return self.weigh_and_log(losses)
