@@ -163,8 +163,6 @@ gallery: $(READY) ## one page of 64 scenes in order, their nearest training scan
 
 r3dpa-s: $(READY) ## train the second edition of r3dpa-s: 20 hours of a core; stop and repeat at any time [SCANS=8000]
 	OMP_NUM_THREADS=1 nice -n 19 $(BIN)/r3dpa data prepare $(SECOND_DATA)
-	$(FIT_SECOND) --config conf/data/labelled_points.yaml --config conf/experiment/waffleiron_s_2.yaml \
-		--run_dir $(SECOND)/teacher
 	OMP_NUM_THREADS=1 nice -n 19 $(BIN)/r3dpa data prepare $(SECOND_ALIGNED)
 	$(FIT_SECOND) $(SECOND_DATA) --config conf/r3dpa_s_2/vae_alignment.yaml --run_dir $(SECOND)/vae
 	$(FIT_SECOND) $(SECOND_DATA) --config conf/r3dpa_s_2/vae_alignment.yaml \
@@ -180,7 +178,7 @@ r3dpa-s: $(READY) ## train the second edition of r3dpa-s: 20 hours of a core; st
 	$(BIN)/r3dpa convert $(SECOND)/few_step/checkpoints/last.ckpt $(SECOND)/r3dpa-s.safetensors \
 		--networks vae ema ema_latent_norm --half --overwrite
 	$(BIN)/r3dpa data objects --data conf/r3dpa_s_2/data.yaml --ckpt $(SECOND)/r3dpa-s.safetensors \
-		--features_ckpt $(SECOND)/teacher/waffleiron_s_2.safetensors --out $(SECOND)/r3dpa-s.objects
+		--out $(SECOND)/r3dpa-s.objects
 
 r3dpa-s-control: $(READY) ## its control without alignment, latent noise and joint stage: after make r3dpa-s
 	$(FIT_SECOND) $(SECOND_DATA) --config conf/r3dpa_s_2/vae_alignment.yaml \

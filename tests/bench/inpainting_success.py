@@ -1,14 +1,14 @@
 """Whether edits do what is asked: objects in boxes, and scenes of two halves.
 
     python tests/bench/inpainting_success.py --ckpt r3dpa-s.safetensors --objects r3dpa-s.objects \
-        --data conf/r3dpa_s_2/data.yaml --teacher runs/r3dpa_s_2/teacher --out edits.json
+        --data conf/r3dpa_s_2/data.yaml --out edits.json
 
 Inpainting: in held-out scans, a box of the size of the object on free ground in sight, 8 to 16 m
 away, is made anew, guided and unguided, from the same noise. The box then holds such an object by
-class, if 5 of its points, and half of those above the ground, are of the class by the teacher's
-head; by size, if those above the ground reach 0.6 to 1.2 of the height of the object, or of what
-the sensor sees of it, and span at least 0.3 of its width and at most 1.2 of its length.
-``unchanged``: share of scenes whose pixels outside the mask equal the scan's.
+class, if 5 of its points, and half of those above the ground, are of the class by the teacher; by
+size, if those above the ground reach 0.6 to 1.2 of the height of the object, or of what the sensor
+sees of it, and span at least 0.3 of its width and at most 1.2 of its length. ``unchanged``: share
+of scenes whose pixels outside the mask equal the scan's.
 
 Mixing: scenes of two halves of scans; mean cosine of the teacher's cells of a half with its own and
 the other source. Half an hour of a core per class, a third of it for mixing.
@@ -35,7 +35,6 @@ from r3dpa.editing import EditSettings, SceneEditor
 from r3dpa.editing.objects import ObjectLibrary
 from r3dpa.editing.regions import box3d, sector_weights
 from r3dpa.features import WaffleIronS2
-from r3dpa.features.voxels import collate_scans
 from r3dpa.geometry import SEMANTIC_CLASSES, Pixels, unproject
 
 NAMES = [semantic.name for semantic in SEMANTIC_CLASSES]
@@ -50,27 +49,26 @@ GROUND_M, NEAREST_M, FARTHEST_M, TRIES = 0.25, 8.0, 16.0, 50
 
 
 class Teacher:
-    """Feature grids and classes of points by the teacher in the folder of its training."""
+    """Feature grids and classes of points by the teacher."""
 
-    def __init__(self, folder, dim):
-        self.extractor = WaffleIronS2(folder / "waffleiron_s_2.safetensors", dim)
-        state = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
-        self.weight, self.bias = (
-            state[f"class_head.{name}"].float() for name in ("weight", "bias")
-        )
+    def __init__(self, dim, weights=None):
+        self.extractor = WaffleIronS2(weights, dim)
 
-    @torch.no_grad()
     def classes(self, points):
         """Numbers of classes ``(P,)`` of points ``(P, 4)``."""
-        prepared = self.extractor.prepare(points)
-        tokens = self.extractor.tokens(collate_scans([prepared]))
-        return F.linear(tokens, self.weight, self.bias).argmax(dim=1)[prepared.upsample]
+        return self.extractor.classes(points)
 
     @torch.no_grad()
     def grid(self, points, projection, grid_size):
         """Feature grid ``(N, F)`` of points ``(P, 4)``."""
         sample = PointSample(None, None, points, self.extractor.prepare(points))
         return pooled_grids(self.extractor, [sample], projection, [grid_size])[grid_size][0]
+
+
+def points_made(result, scan, projection):
+    """Points ``(P, 4)`` of an edit; a model without intensity leaves those of the scan."""
+    intensity = scan.intensity if result.intensity is None else result.intensity[0]
+    return points_at_pixels(Pixels(result.range_m[0], intensity), projection)
 
 
 def inside(points, centre, size):
@@ -127,7 +125,7 @@ def inpainting(editors, scans, library, teacher, name):
             start = time.perf_counter()
             made = editor.inpaint(pixels, mask, [number], feature=features[how])
             seconds = time.perf_counter() - start
-            points = points_at_pixels(Pixels(made.range_m[0], made.intensity[0]), projection)
+            points = points_made(made, pixels, projection)
             matches = teacher.classes(points) == NAMES.index(of_class)
             found = judge(points, matches, centre, size, projection.sensor.inclination_max_deg)
             same = torch.equal(made.range_m[0][~mask], pixels.range_m[~mask])
@@ -158,7 +156,7 @@ def mixing(editors, scans, teacher):
             start = time.perf_counter()
             made = editor.mix(grids, weights, [number])
             seconds = time.perf_counter() - start
-            points = points_at_pixels(Pixels(made.range_m[0], made.intensity[0]), projection)
+            points = points_made(made, pair[0], projection)
             mixed = teacher.grid(points, projection, size)
             for side, half in enumerate(weights > 0.99):
                 cosines = [mean_cosine(mixed, grid, half) for grid in grids]
@@ -173,7 +171,7 @@ def main(arguments=None):
     parser.add_argument("--ckpt", required=True)
     parser.add_argument("--objects", type=Path, required=True, help="file of r3dpa data objects")
     parser.add_argument("--data", type=Path, required=True, help="data YAML of cached images")
-    parser.add_argument("--teacher", type=Path, required=True, help="folder of its training")
+    parser.add_argument("--teacher", type=Path, help="its weights; default: those of the package")
     parser.add_argument("--num", type=int, default=100, help="scans")
     parser.add_argument("--classes", nargs="+", default=list(OBJECTS), choices=OBJECTS)
     parser.add_argument("--steps", type=int, default=EditSettings.steps)
@@ -187,7 +185,7 @@ def main(arguments=None):
     data.setup("fit")
     scans = [data.images.read(scan) for scan in evenly(data.val_set.scans, options.num)]
     library = ObjectLibrary.load(options.objects)
-    teacher = Teacher(options.teacher, library.features.shape[1])
+    teacher = Teacher(library.features.shape[1], options.teacher)
     results = {name: inpainting(editors, scans, library, teacher, name) for name in options.classes}
     results["mixing"] = mixing(editors, scans, teacher)
     text = json.dumps({"steps": options.steps, **results}, indent=1)

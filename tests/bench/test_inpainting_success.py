@@ -66,12 +66,9 @@ def test_the_figures_of_a_tiny_model_are_written(tmp_path):
     dim = SIT_ARGS["feature_dim"]
     grid = ScanGrid((-16.0, -16.0, -4.0), (16.0, 16.0, 4.0), (4.0, 4.0, 4.0), 1.0, 4)
     network = WaffleIron(4, 3, grid.cells)
-    save_weights(tmp_path / "waffleiron_s_2.safetensors", network, nn.BatchNorm1d(4), grid)
-    head = nn.Linear(4, NUM_CLASSES).state_dict()
-    (tmp_path / "checkpoints").mkdir()
-    content = {"state_dict": {f"class_head.{key}": value for key, value in head.items()}}
-    torch.save(content, tmp_path / "checkpoints" / "last.ckpt")
-    about = Teacher(tmp_path, dim).extractor
+    weights, head = tmp_path / "waffleiron_s_2.safetensors", nn.Linear(4, NUM_CLASSES)
+    save_weights(weights, network, nn.BatchNorm1d(4), grid, class_head=head)
+    about = Teacher(dim, weights).extractor
     cars = (ObjectClass("car", 1, 1, 1, 0.0),)
     card = {"name": about.name, "settings": {}}
     library = ObjectLibrary(torch.ones(1, dim), cars, card, {}, (2, 8))
@@ -81,7 +78,7 @@ def test_the_figures_of_a_tiny_model_are_written(tmp_path):
     data["init_args"] = {"root": str(tmp_path / "images"), "num_scans": 10, "grid_size": [2, 8]}
     data["init_args"] |= {"sensor": {"beams": 16, "columns": 64}, "codec": codec}
     (tmp_path / "data.yaml").write_text(yaml.safe_dump({"data": data}))
-    words = ["--ckpt", ckpt, "--objects", tmp_path / "lib.objects", "--teacher", tmp_path]
+    words = ["--ckpt", ckpt, "--objects", tmp_path / "lib.objects", "--teacher", weights]
     words += ["--data", tmp_path / "data.yaml", "--num", 2, "--classes", "car", "--steps", 2]
     main([*map(str, words), "--out", str(tmp_path / "edits.json")])
     results = json.loads((tmp_path / "edits.json").read_text())

@@ -10,7 +10,7 @@ from tiny_stages import SILENT
 
 from r3dpa.data import LabelledPointDataModule, LidarDataModule, write_bin
 from r3dpa.data.labels import write_labels
-from r3dpa.features import Masking, WaffleIron, WaffleIronS
+from r3dpa.features import Masking, WaffleIron, WaffleIronS, WaffleIronS2
 from r3dpa.modules import PointSegmentation
 from r3dpa.modules.point_segmentation import class_loss
 
@@ -93,7 +93,13 @@ def test_training_learns_classes_and_goes_on_from_its_weights(tmp_path, data):
         rounded = value.half().to(value.dtype)  # the file is in half precision
         assert torch.equal(further.network.state_dict()[key], rounded), key
     assert torch.equal(further.norm.running_mean, module.norm.running_mean.half().float())
-    assert WaffleIronS(file, dim=16)(cloud(9)).isfinite().all()
+    source, points = WaffleIronS2(file, dim=16), cloud(9)
+    assert source(points).isfinite().all()
+    expected = torch.where(points[:, 2] > 0, CAR[1], ROAD[1])
+    assert (source.classes(points) == expected).float().mean() > 0.8
+    assert (source.classes(points + 1000) == -1).all()  # out of its field of view
+    with pytest.raises(ValueError, match="know no classes: take waffleiron-s-2"):
+        WaffleIronS().classes(points)
 
 
 def test_scans_without_classes_are_refused():

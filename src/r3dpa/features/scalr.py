@@ -34,6 +34,7 @@ from r3dpa.features.voxels import (
     prepare_scan,
 )
 from r3dpa.features.waffleiron import WaffleIron
+from r3dpa.geometry import UNKNOWN_CLASS
 from r3dpa.io import UNPICKLING_ERRORS, atomic_path, first_line, weights_sha256
 
 _RELEASED = "ckpt_last.pth of WI_768-DINOv2_ViT_L_14-NS_KI_PD"
@@ -57,6 +58,7 @@ _OFFICIAL_NAMES = {
 _CPU_POINTS = 16384  # in one pass
 _FOLDER = Path(str(files("r3dpa.features")))
 _ABOUT = "waffleiron"  # metadata key of that file: sizes of the network, grid
+_CLASSES = "classes."  # in front of the weights of a layer that gives logits of classes
 
 
 class TokenFeatures(FrozenNetwork):
@@ -197,10 +199,31 @@ class WaffleIronS(TokenFeatures):
         basis = random_basis(dim, network.width, torch.Generator().manual_seed(0))
         self.register_buffer("basis", basis)
         self.settings = {"weights": sha256(self), "version": 1}
+        self.class_head: nn.Linear | None = None  # no part of the features
+        if _CLASSES + "weight" in state:
+            num_classes = len(state[_CLASSES + "bias"])
+            self.class_head = nn.Linear(network.width, num_classes).requires_grad_(False)
+            head = {key: state[_CLASSES + key] for key in ("weight", "bias")}
+            self.class_head.load_state_dict(head)
 
     def tokens(self, batch: PointCloudBatch) -> Tensor:
         """Standardised tokens ``(N, F)`` float32."""
         return (super().tokens(batch) - self.mean) / self.deviation
+
+    @torch.no_grad()
+    def classes(self, points: Tensor) -> Tensor:
+        """Likeliest class ``(P,)`` of points ``(P, 4)``: places in ``geometry.SEMANTIC_CLASSES``.
+
+        Raises:
+            ValueError: If the weights hold no classes, as those of ``waffleiron-s``.
+        """
+        if self.class_head is None:
+            raise ValueError(f"these weights of {self.name} know no classes: take waffleiron-s-2")
+        prepared = self.prepare(points)
+        if not len(prepared.features):
+            return torch.full((len(points),), UNKNOWN_CLASS)
+        tokens = self.tokens(collate_scans([prepared]).to(self.mean.device))
+        return self.class_head(tokens).argmax(dim=1).cpu()[prepared.upsample]
 
     def forward(self, points: Tensor) -> Tensor:
         """Features ``(P, dim)`` of unit norm of the points ``(P, 4)``."""
@@ -212,7 +235,7 @@ class WaffleIronS(TokenFeatures):
 
 
 class WaffleIronS2(WaffleIronS):
-    """``waffleiron-s-2``: the same network, trained anew on classes and masked geometry.
+    """``waffleiron-s-2``: a coarser network, trained anew on the classes of simulated points.
 
     It shares no weights with ``waffleiron-s``, the network behind FWID, so that FWID may judge a
     generator that was aligned with this one. See :class:`r3dpa.modules.PointSegmentation`.
@@ -223,14 +246,22 @@ class WaffleIronS2(WaffleIronS):
 
 
 def save_weights(
-    path: Path, network: WaffleIron, norm: nn.BatchNorm1d, grid: ScanGrid, half: bool = False
+    path: Path,
+    network: WaffleIron,
+    norm: nn.BatchNorm1d,
+    grid: ScanGrid,
+    half: bool = False,
+    class_head: nn.Linear | None = None,
 ) -> None:
     """Write what :class:`WaffleIronS` reads; ``norm`` has the statistics of the tokens.
 
-    ``half`` stores floating-point values as float16, in half the bytes.
+    ``half`` stores floating-point values as float16, in half the bytes. ``class_head`` gives logits
+    of classes from standardised tokens.
     """
     state = {f"network.{key}": value for key, value in network.state_dict().items()}
     state |= {f"norm.{key}": value for key, value in norm.state_dict().items()}
+    if class_head is not None:
+        state |= {f"{_CLASSES}{key}": value for key, value in class_head.state_dict().items()}
     if half:
         state = {k: v.half() if v.is_floating_point() else v for k, v in state.items()}
     state = {key: value.detach().cpu().contiguous() for key, value in state.items()}
@@ -268,8 +299,8 @@ def feature_source(name: str, ckpt: str | Path | None = None, dim: int = 768) ->
 
     Args:
         name: ``"scalr"``: distilled from images, needs the released checkpoint;
-            ``"waffleiron-s"``: trained on simulated scans, ``"waffleiron-s-2"`` on their classes
-            too; ``"geometric"``: local shape, without training.
+            ``"waffleiron-s"``: trained on simulated scans, ``"waffleiron-s-2"`` on their classes;
+            ``"geometric"``: local shape, without training.
         ckpt: Weights of ``"scalr"``, or of a ``"waffleiron-s"`` in place of the shipped ones.
         dim: Width D of the features; for ``"scalr"``, the width of its checkpoint.
     """

@@ -59,6 +59,7 @@ class PointPretraining(LightningModule):
         self.optimizer_config = OptimizerConfig(
             lr=lr, weight_decay=weight_decay, warmup_steps=warmup, cosine=True
         )
+        self.class_head: nn.Linear | None = None  # written with the weights
         self.hidden_token = nn.Parameter(torch.zeros(network.width))
         self.norm = nn.BatchNorm1d(network.width, affine=False)
         self.head = nn.Linear(network.width, NUM_TARGETS * _NUM_BINS)
@@ -163,4 +164,5 @@ class PointPretraining(LightningModule):
         trial = cast(Any, self.trainer).fast_dev_run
         if self.trainer.is_global_zero and self.grid is not None and not trial:
             path = Path(self.trainer.default_root_dir) / self.source.shipped.name
-            save_weights(path, self.network, self.norm, self.grid, half=self.writes_half)
+            head, half = self.class_head, self.writes_half
+            save_weights(path, self.network, self.norm, self.grid, half, head)

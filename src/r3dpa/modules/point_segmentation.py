@@ -45,7 +45,7 @@ class PointSegmentation(PointPretraining):
         super().__init__(network, **kwargs)
         self.geometry_weight = geometry_weight
         self.head.requires_grad_(geometry_weight > 0)  # DDP wants a gradient of every parameter
-        self.class_head = nn.Linear(network.width, NUM_CLASSES)
+        self.class_head: nn.Linear = nn.Linear(network.width, NUM_CLASSES)
         if start is not None:
             state, trained, _ = read_weights(start)
             network.load_state_dict(trained.state_dict())
