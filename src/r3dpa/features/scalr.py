@@ -184,10 +184,6 @@ class WaffleIronS(TokenFeatures):
     shipped = _FOLDER / "waffleiron_s.safetensors"
 
     def __init__(self, weights: Path | None = None, dim: int = 768) -> None:
-        if weights is None and not self.shipped.is_file():
-            raise ValueError(
-                f"no weights of {self.name} are in this package: give its weights file"
-            )
         state, network, grid = read_weights(Path(weights) if weights else self.shipped)
         super().__init__(network, grid)
         if dim < network.width:
@@ -215,7 +211,7 @@ class WaffleIronS(TokenFeatures):
         """Likeliest class ``(P,)`` of points ``(P, 4)``: places in ``geometry.SEMANTIC_CLASSES``.
 
         Raises:
-            ValueError: If the weights hold no classes, as those of ``waffleiron-s``.
+            ValueError: If the weights hold no classes; ``waffleiron-s`` has none.
         """
         if self.class_head is None:
             raise ValueError(f"these weights of {self.name} know no classes: take waffleiron-s-2")

@@ -33,7 +33,7 @@ class FeatureExtraction(LightningModule):
         features_dir: Folder of the grids of this extractor.
         scans: Scans to extract; only the list of the first process counts.
         images: Cached images whose pixels are the points, in place of the files of the scans; only
-            those of the first process count.
+            the first process's count.
         batch_size: Scans per batch and process.
         num_workers: Loader processes per process.
 
