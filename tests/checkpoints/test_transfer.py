@@ -132,7 +132,7 @@ class TestProjectionHead:
         source = self.source()
         sit = randomised(SiT(**SIT_ARGS | changes))
         head = copy.deepcopy(sit.projector.state_dict())
-        load_into({"sit": sit}, with_projector_of(source, sit), "flow_matching")
+        load_into({"sit": sit}, with_projector_of(source, sit, aligns=True), "flow_matching")
         torch.testing.assert_close(sit.projector.state_dict(), head, **EXACT)
         for key, value in source.network("ema").state_dict.items():
             if not key.startswith("projector."):
@@ -140,15 +140,17 @@ class TestProjectionHead:
 
     def test_is_kept_where_it_fits(self):
         source = self.source()
-        assert with_projector_of(source, SiT(**SIT_ARGS)).networks == source.networks
+        sit = SiT(**SIT_ARGS)
+        assert with_projector_of(source, sit, aligns=True).networks == source.networks
 
     @pytest.mark.parametrize(
         "facts", [{"feature_source": "scalr"}, {}], ids=["aligned", "official"]
     )
-    def test_that_has_learned_is_refused(self, facts):
+    def test_that_has_learned_is_refused_in_a_run_that_aligns(self, facts):
         source = self.source(**facts)
         if not facts:
             source = replace(source, stage="official")
         sit = SiT(**SIT_ARGS | {"feature_dim": 5})
         with pytest.raises(ValueError, match="projector"):
-            load_into({"sit": sit}, with_projector_of(source, sit), "flow_matching")
+            load_into({"sit": sit}, with_projector_of(source, sit, aligns=True), "flow_matching")
+        load_into({"sit": sit}, with_projector_of(source, sit, aligns=False), "flow_matching")

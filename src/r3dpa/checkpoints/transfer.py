@@ -113,14 +113,14 @@ def with_further_channels(checkpoint: Checkpoint, vae: VAE) -> Checkpoint:
     return replace(checkpoint, networks=networks, geometry=geometry)
 
 
-def with_projector_of(checkpoint: Checkpoint, sit: SiT) -> Checkpoint:
-    """Checkpoint whose SiTs have the projection head of ``sit`` if theirs never learned and differ.
+def with_projector_of(checkpoint: Checkpoint, sit: SiT, aligns: bool) -> Checkpoint:
+    """Checkpoint whose SiTs have the head of ``sit`` if their own differ and are not needed.
 
-    So a run that aligns may start from one that did not, although features of another width, a head
-    of another kind or after another block need other weights. Unchanged if the heads fit, if the
-    checkpoint was trained with 3D features, or if it is official.
+    They are needed in a run that ``aligns`` if they have learned, from 3D features or officially.
+    Otherwise features of another width, a head of another kind or after another block may follow.
     """
-    if checkpoint.feature_source is not None or checkpoint.stage == "official":
+    learned = checkpoint.feature_source is not None or checkpoint.stage == "official"
+    if aligns and learned:
         return checkpoint
     head = {k: v for k, v in sit.state_dict().items() if k.startswith(_PROJECTOR)}
     networks = dict(checkpoint.networks)

@@ -223,15 +223,17 @@ class GenerativeModule(Stage):
     def previous_networks(self, before: Checkpoint) -> Checkpoint:
         """Checkpoint of the stage before, with the networks that this stage has.
 
-        Average velocities of stage few_step are left out, and so are projection heads of a SiT that
-        was not aligned.
+        Average velocities of stage few_step are left out, and so are projection heads that this
+        run cannot use.
         """
         networks = {}
         for name, state in before.networks.items():
             flow = {k: v for k, v in state.state_dict.items() if not k.startswith("average.")}
             networks[name] = replace(state, state_dict=flow)
         before = replace(before, networks=networks)
-        return with_projector_of(before, self.sit) if isinstance(self.sit, SiT) else before
+        if not isinstance(self.sit, SiT):
+            return before
+        return with_projector_of(before, self.sit, aligns=self.needs_features())
 
     # Training
 
