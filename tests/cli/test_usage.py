@@ -40,8 +40,8 @@ MISTAKES = {
     "sample --out x --ckpt no.ckpt": "no checkpoint file no.ckpt",
     "sample --out x --stpes 3": "unknown option --stpes (did you mean --steps?)",
     "edit vary --scan no.bin --out x": "--scan no.bin: no such file or folder",
-    "edit mix --left a.bin --right b.bin --out x": "s.safetensors was trained without 3D features",
-    "data objects --data x --out o.safetensors": "s.safetensors was trained without 3D features",
+    "edit mix --left a.bin --right b.bin --out x --ckpt s.safetensors": "s.safetensors was trained without 3D features",
+    "data objects --data x --out o.safetensors --ckpt s.safetensors": "s.safetensors was trained without 3D features",
     "data check no": "bad: no: is no folder and no file",
     "data features --data . --extracter x": "--extracter (did you mean --extractor?)",
     "data view no": "no: no such file or folder",
@@ -71,8 +71,9 @@ def answers(tmp_path_factory):
     program = f"""
 import sys, json, io, contextlib, pathlib
 from r3dpa.cli import main
-for name in ("a.bin", "b.bin"):
+for name in ("a.bin", "b.bin", "s.safetensors"):
     pathlib.Path(name).touch()
+pathlib.Path("s.yaml").write_text("feature_source: null")
 answers = []
 for line in {list(MISTAKES)}:
     text = io.StringIO()
