@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
-# `make r3dpa-s` and its control on one GPU and 16 cores, in a quarter of an hour: larger batches than on
-# a CPU, and side by side what does not wait for each other.
+# `make r3dpa-s` and its control on one GPU and 16 cores, planned for a quarter of an hour and not run yet: larger
+# batches than on a CPU, and side by side what does not wait for each other.
 #
 #   bash conf/launch/r3dpa_s_gpu.sh runs/r3dpa_s_gpu
-#   TRIAL=1 bash conf/launch/r3dpa_s_gpu.sh runs/trial # two steps of each stage, on a CPU too: ten minutes
+#   TRIAL=1 bash conf/launch/r3dpa_s_gpu.sh runs/trial # two steps of each stage, on a CPU too
 #
 # The weights of each stage lie in FOLDER/weights as soon as it ends. The same call leaves out what is done and goes on
 # where a stage was stopped.
