@@ -46,7 +46,6 @@ STARTS = {  # data by overlay of the demo or experiment; test_stages starts the 
 R3DPA_S = {  # in the order given
     "trained": ("data", "vae_alignment"),
     "more": ("data", "vae_alignment", "vae_more"),
-    "labels": ("data", "data_labels", "vae_alignment", "vae_alignment_labels"),
     "decoder": ("data", "vae_alignment", "vae_decoder"),
     "flow": ("data", "flow_matching"),
     "few_step": ("data", "flow_matching", "few_step"),

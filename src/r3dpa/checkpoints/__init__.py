@@ -9,6 +9,7 @@ from r3dpa.checkpoints.transfer import (
     vae_fingerprint,
     with_further_channels,
     with_projector_of,
+    without_further_channels,
 )
 from r3dpa.io import weights_sha256
 
@@ -27,4 +28,5 @@ __all__ = [
     "weights_sha256",
     "with_further_channels",
     "with_projector_of",
+    "without_further_channels",
 ]

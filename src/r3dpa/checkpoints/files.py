@@ -32,6 +32,7 @@ from r3dpa.io import (
     sha256_of,
     source_commit,
     text_table,
+    weights_sha256,
 )
 from r3dpa.nn.image_vae import ImageVAE
 from r3dpa.pretrained import weights_file
@@ -52,6 +53,7 @@ _LIGHTNING = {
 }
 # A class that Lightning 1.4 writes as a key, in the checkpoints of LiDM; read as ``object``.
 _OLD_CALLBACK = "pytorch_lightning.callbacks.model_checkpoint.ModelCheckpoint"
+_ENCODER = ("encoder.", "quant_conv.")
 _LOST = ("sensor and encoding", "step", "arguments of the latent statistics")
 _DIFFUSERS_KEY = "encoder.down_blocks.0.resnets.0.norm1.weight"
 # Names of attention layers before diffusers 0.14, as in the files of Stable Diffusion itself.
@@ -149,6 +151,7 @@ def convert(
     encoding: Literal["linear", "log2"] | None = None,
     networks: Sequence[str] | None = None,
     half: bool = False,
+    decoder: str | Path | None = None,
 ) -> str:
     """Convert a checkpoint of any layout to ours, or to the official one.
 
@@ -161,10 +164,13 @@ def convert(
         Files, networks and what was not converted, as text.
 
     Raises:
-        ValueError: If a network has no counterpart in the other layout, or a file exists.
+        ValueError: If a network has no counterpart in the other layout, a file exists, or the VAE
+            of ``decoder`` has other latents.
     """
     source, out = Path(source), Path(out)
     checkpoint = read_checkpoint(source, sit_args=sit_args, encoding=encoding)
+    if decoder is not None:
+        checkpoint = _with_decoder_of(checkpoint, read_checkpoint(decoder))
     if networks is not None or half:
         checkpoint = replace(checkpoint, networks=_select_networks(checkpoint, networks, half))
     left_out = dict(checkpoint.left_out)
@@ -224,6 +230,24 @@ def _select_networks(
                 }
                 chosen[name] = replace(state, state_dict=weights)
     return chosen
+
+
+def _with_decoder_of(checkpoint: Checkpoint, other: Checkpoint) -> Checkpoint:
+    """Checkpoint with the VAE of ``other``, whose encoder must be its own, and its codec."""
+    vae = other.network("vae")
+    before, after = (
+        weights_sha256({k: v.float() for k, v in of.state_dict.items() if k.startswith(_ENCODER)})
+        for of in (checkpoint.network("vae"), vae)
+    )
+    if before != after:
+        raise ValueError(
+            f"{other.path} has another encoder than {checkpoint.path}, so other latents: give a "
+            "checkpoint of stage vae_alignment that started from it with train_encoder false"
+        )
+    geometry = checkpoint.geometry
+    if geometry is not None and other.geometry is not None:
+        geometry = {**geometry, "codec": other.geometry["codec"]}
+    return replace(checkpoint, networks={**checkpoint.networks, "vae": vae}, geometry=geometry)
 
 
 def _refuse_existing(paths: list[Path], overwrite: bool) -> None:

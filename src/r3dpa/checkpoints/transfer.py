@@ -94,23 +94,39 @@ def with_further_channels(checkpoint: Checkpoint, vae: VAE) -> Checkpoint:
     """Checkpoint of a VAE of range and return as one that has the intensity and class of ``vae``.
 
     The layers of these channels have the values that they have in ``vae``, all others stay: the
-    encoder gives the same latents, and the decoder the same ranges and returns. Unchanged where
-    ``vae`` has no such layers, or the checkpoint has some.
+    encoder gives the same latents, and the decoder the same ranges and returns. Unchanged where the
+    checkpoint lacks no such layer.
     """
-    state = checkpoint.network("vae")
-    layers = {k: v for k, v in vae.state_dict().items() if ".further_" in k}
-    if not layers or any(".further_" in key for key in state.state_dict):
+    weights = checkpoint.network("vae").state_dict
+    own = vae.state_dict()
+    layers = {key: own[key] for key in own.keys() - weights.keys() if ".further_" in key}
+    return _with_channels_of(checkpoint, vae, {**weights, **layers}) if layers else checkpoint
+
+
+def without_further_channels(checkpoint: Checkpoint, vae: VAE) -> Checkpoint:
+    """Checkpoint whose VAE decodes no intensity and class if ``vae`` has none; all else stays.
+
+    Unchanged where the encoder sees them: without, its latents would be others.
+    """
+    weights = checkpoint.network("vae").state_dict
+    rest = {key: value for key, value in weights.items() if ".further_" not in key}
+    encoded = any(key.startswith("encoder.further_") for key in weights)
+    if vae.image_channels > vae.in_channels or len(rest) == len(weights) or encoded:
         return checkpoint
+    return _with_channels_of(checkpoint, vae, rest)
+
+
+def _with_channels_of(checkpoint: Checkpoint, vae: VAE, weights: Weights) -> Checkpoint:
+    """Checkpoint with these weights of a VAE and the intensity and class of ``vae``."""
+    state = checkpoint.network("vae")
     channels = {"intensity": vae.intensity, "num_classes": vae.num_classes}
-    wider = replace(
-        state, init_args={**state.init_args, **channels}, state_dict={**state.state_dict, **layers}
-    )
-    networks = {**checkpoint.networks, "vae": wider}
+    init_args = {**state.init_args, **channels, "encode_further": vae.encode_further}
+    changed = replace(state, init_args=init_args, state_dict=weights)
     geometry = checkpoint.geometry
     if geometry is not None:
         channels = {"intensity_channel": vae.intensity, "num_classes": vae.num_classes}
         geometry = {**geometry, "codec": {**geometry["codec"], **channels}}
-    return replace(checkpoint, networks=networks, geometry=geometry)
+    return replace(checkpoint, networks={**checkpoint.networks, "vae": changed}, geometry=geometry)
 
 
 def with_projector_of(checkpoint: Checkpoint, sit: SiT, aligns: bool) -> Checkpoint:

@@ -17,6 +17,7 @@ def convert(
     encoding: Literal["linear", "log2"] | None = None,
     networks: list[str] | None = None,
     half: bool = False,
+    decoder: Path | None = None,
 ) -> str:
     """Convert official checkpoints into ours, or ours into official ones.
 
@@ -30,6 +31,8 @@ def convert(
         encoding: Official files only: range encoding, if the file lacks it.
         networks: Write these alone; sampling needs ``vae ema ema_latent_norm``.
         half: Write weights in float16, half as large.
+        decoder: Checkpoint whose VAE is taken in place of the source's. It must have the same
+            encoder, as after ``train_encoder: false``.
     """
     from r3dpa.checkpoints import convert as convert_checkpoint
 
@@ -42,6 +45,7 @@ def convert(
         encoding=encoding,
         networks=networks,
         half=half,
+        decoder=decoder,
     )
 
 

@@ -159,8 +159,8 @@ class SceneEditor:
         """Return the normalised latents ``(B, C, h, w)``, means of the VAE.
 
         Args:
-            scan: One scan, or range images ``(B, H, W)`` in metres. VAEs with intensity need scans
-                with one in [0, 1].
+            scan: One scan, or range images ``(B, H, W)`` in metres. VAEs that encode the intensity
+                need scans with one in [0, 1].
         """
         if isinstance(scan, Tensor | np.ndarray) and scan.ndim == 3:
             return self._encode(Pixels(torch.as_tensor(scan)))
@@ -349,7 +349,7 @@ class SceneEditor:
 
     def _encode(self, pixels: Pixels) -> Tensor:
         """Normalised latents of pixels ``(B, H, W)``."""
-        codec, device = self.generator.geometry.codec, self.generator.device
+        codec, vae = self.generator.geometry.codec, self.generator.vae
         intensity = pixels.intensity
         uses_intensity = codec.intensity_channel or codec.reflectance
         if uses_intensity and intensity is not None and intensity.max() > 1:
@@ -357,8 +357,9 @@ class SceneEditor:
                 f"the scan has intensities up to {intensity.max():g}; the model needs 0..1: divide "
                 "them by their full scale, such as 255"
             )
-        image = codec.to_image(*map_pixels(lambda values: values.to(device), pixels))
-        return self.generator.latent_norm.normalise(self.generator.vae.encode(image).mean)
+        pixels = map_pixels(lambda values: values.to(self.generator.device), pixels)
+        image = codec.first_channels(vae.encoded_channels).to_image(*pixels)
+        return self.generator.latent_norm.normalise(vae.encode(image).mean)
 
     def _result(
         self,

@@ -211,6 +211,12 @@ class RangeCodec:
         further = self.intensity_channel + (self.num_classes > 0)
         return 1 + (self.return_channel or self.reflectance) + further
 
+    def first_channels(self, num: int) -> Self:
+        """Codec of the first ``num`` channels: all, or range and return alone."""
+        if num == self.channels:
+            return self
+        return replace(self, intensity_channel=False, num_classes=0)
+
     def to_image(
         self, range_m: Tensor, intensity: Tensor | None = None, classes: Tensor | None = None
     ) -> Tensor:

@@ -17,6 +17,7 @@ from r3dpa.checkpoints import (
     read_checkpoint,
     transfer_rgb,
     with_projector_of,
+    without_further_channels,
 )
 from r3dpa.checkpoints.image_size import resize_to
 from r3dpa.checkpoints.transfer import TransferRow
@@ -223,14 +224,16 @@ class GenerativeModule(Stage):
     def previous_networks(self, before: Checkpoint) -> Checkpoint:
         """Checkpoint of the stage before, with the networks that this stage has.
 
-        Average velocities of stage few_step are left out, and so are projection heads that this
-        run cannot use.
+        Average velocities of stage few_step are left out, and so are intensity and class of a VAE
+        where this run decodes none, and projection heads that this run cannot use.
         """
         networks = {}
         for name, state in before.networks.items():
             flow = {k: v for k, v in state.state_dict.items() if not k.startswith("average.")}
             networks[name] = replace(state, state_dict=flow)
         before = replace(before, networks=networks)
+        if "vae" in networks and "vae" in self.init_networks:
+            before = without_further_channels(before, self.vae)
         if not isinstance(self.sit, SiT):
             return before
         return with_projector_of(before, self.sit, aligns=self.needs_features())

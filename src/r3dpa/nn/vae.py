@@ -166,7 +166,9 @@ class VAE(Autoencoder):
     ``intensity`` and ``num_classes`` add channels to such images: the encoder takes the class as
     one channel for each, the decoder predicts their logits. They enter and leave through layers of
     their own, whose kernels are 1 x 1 to save time. The one of the encoder starts at 0: with the
-    other weights of a VAE without these channels, this one has its latents.
+    other weights of a VAE without these channels, this one has its latents. Without
+    ``encode_further`` there is none, and the latents, which tell of range and return alone, are
+    decoded to intensity and class as well.
 
     Source: Ran et al., "Towards realistic scene generation with LiDAR diffusion models" (CVPR
     2024); R3DPA (ICRA 2026) uses h2p4d8. State-dict keys follow the official checkpoints.
@@ -188,6 +190,7 @@ class VAE(Autoencoder):
         intensity: Images have a channel of intensity after range and return.
         num_classes: Classes of the returns, whose number is the last channel of the images; 0 where
             they have none.
+        encode_further: The encoder sees intensity and class, not the decoder alone.
 
     Example:
         >>> vae = VAE(channels=32, num_res_blocks=1)
@@ -211,6 +214,7 @@ class VAE(Autoencoder):
         least_scale: float = math.exp(-6),
         intensity: bool = False,
         num_classes: int = 0,
+        encode_further: bool = True,
     ) -> None:
         if least_scale <= 0:
             raise ValueError(f"least_scale must be above 0, got {least_scale}")
@@ -240,9 +244,8 @@ class VAE(Autoencoder):
         outputs = in_channels if modes == 1 else RangeMixture.num_outputs + 1
         strides = (stem, *strides)
         further = intensity + num_classes
-        encoder = _Encoder(
-            in_channels, 2 * latent_channels, down, num_res_blocks, stem, intensity, num_classes
-        )
+        seen = (intensity, num_classes) if encode_further else (False, 0)
+        encoder = _Encoder(in_channels, 2 * latent_channels, down, num_res_blocks, stem, *seen)
         decoder = _Decoder(
             latent_channels, outputs, up, num_res_blocks + 1, legacy_upsample, stem, further
         )
@@ -255,11 +258,17 @@ class VAE(Autoencoder):
         )
         self.modes, self.least_scale = modes, least_scale
         self.intensity, self.num_classes = intensity, num_classes
+        self.encode_further = encode_further
 
     @property
     def image_channels(self) -> int:
         """Channels of the images that it encodes and decodes."""
         return self.in_channels + self.intensity + (self.num_classes > 0)
+
+    @property
+    def encoded_channels(self) -> int:
+        """Channels of the images that its encoder looks at: the first ones."""
+        return self.image_channels if self.encode_further else self.in_channels
 
     def outputs_of(self, prediction: Tensor) -> PixelOutputs:
         """Parts of outputs ``(B, ..., H, W)`` of the decoder."""
