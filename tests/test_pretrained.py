@@ -3,15 +3,17 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 import torch
 from safetensors.torch import load_file
+from tiny_labelled import labelled_checkpoint
 from tiny_networks import tiny_checkpoint, tiny_networks
 
 from r3dpa import SceneGenerator, SceneVAE, pretrained
-from r3dpa.checkpoints import convert, load_into, read_checkpoint
+from r3dpa.checkpoints import convert, load_into, read_checkpoint, save_checkpoint
 from r3dpa.cli import main
 from r3dpa.cli.scene_files import written
 
@@ -100,6 +102,28 @@ def test_a_repository_that_cannot_be_read_is_one_line(monkeypatch, fault, messag
 def test_models_lists_and_shows_cards(shipped):
     assert "tiny" in pretrained.models()
     assert pretrained.models("tiny") == "# tiny: the card\n"
+
+
+def test_a_decoder_that_was_trained_on_takes_the_place_of_the_first(tmp_path):
+    first = labelled_checkpoint(tmp_path, encode_further=False)
+    content = read_checkpoint(first)
+    state = content.network("vae")
+
+    def changed(part, name):
+        weights = {
+            key: value + 0.01 if key.startswith(part) else value
+            for key, value in state.state_dict.items()
+        }
+        networks = {"vae": replace(state, state_dict=weights)}
+        return save_checkpoint(replace(content, networks=networks), tmp_path / name)
+
+    out = tmp_path / "out.safetensors"
+    convert(first, out, decoder=changed("decoder.", "decoder.safetensors"))
+    before, after = load_file(first), load_file(out)
+    others = {key for key in before if not torch.equal(before[key], after[key])}
+    assert others == {key for key in before if key.startswith("vae.decoder.")}
+    with pytest.raises(ValueError, match=r"encoder\.safetensors has another encoder than"):
+        convert(first, out, decoder=changed("quant_conv.", "encoder.safetensors"), overwrite=True)
 
 
 def test_half_precision_rounds_all_but_statistics(shipped, tmp_path):

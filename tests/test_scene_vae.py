@@ -78,3 +78,14 @@ def test_a_scan_and_its_labels_become_latents_and_a_labelled_scene(tmp_path):
     assert scenes.intensity.shape == (1, 16, 64)
     with pytest.raises(ValueError, match="needs scans with an intensity"):
         vae.encode(points[:, :3], labels)
+
+
+def test_an_encoder_of_range_and_return_needs_no_intensity(tmp_path):
+    vae = SceneVAE.from_checkpoint(labelled_checkpoint(tmp_path, encode_further=False), "cpu")
+    points = 10 * torch.randn(500, 4, generator=torch.Generator().manual_seed(0))
+    points[:, 3] = 0.5
+    latents = vae.encode(points, torch.full((500,), 26))
+    assert torch.equal(latents, vae.encode(points[:, :3]))
+    scenes = vae.decode(latents)
+    assert torch.equal(scenes.labels > 0, scenes.range_m > 0)
+    assert scenes.intensity[scenes.range_m > 0].unique().numel() > 20

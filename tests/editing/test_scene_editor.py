@@ -229,14 +229,20 @@ class TestScans:
             editor.encode(scan)
 
 
-@pytest.fixture(scope="module")
-def labelled():
+def labelled_editor(**vae_args):
     codec = RangeCodec(return_channel=True, intensity_channel=True, num_classes=NUM_CLASSES)
     further = {"in_channels": 2, "intensity": True, "num_classes": NUM_CLASSES}
-    networks = tiny_networks(spread=0.05, vae_args=VAE_ARGS | further)
-    torch.nn.init.normal_(networks[0].encoder.further_in.weight)  # as a training makes it
+    networks = tiny_networks(spread=0.05, vae_args=VAE_ARGS | further | vae_args)
     geometry = ScanGeometry(GEOMETRY.projection, codec, GEOMETRY.grid_size)
     return SceneEditor(SceneGenerator(*networks, geometry), EditSettings(steps=2))
+
+
+@pytest.fixture(scope="module")
+def labelled():
+    editor = labelled_editor()
+    layer = editor.generator.vae.encoder.further_in
+    torch.nn.init.normal_(layer.weight)  # as a training makes it
+    return editor
 
 
 @pytest.fixture(scope="module")
@@ -261,6 +267,16 @@ class TestLabels:
             labelled.encode(recorded.points)
         with pytest.raises(ValueError, match=r"intensities up to 2\d\d.*divide them by their full"):
             labelled.encode(replace(recorded, intensity=255 * recorded.intensity))
+
+    def test_scans_without_them_are_edited_where_the_encoder_does_not_see_them(self, recorded):
+        editor = labelled_editor(encode_further=False)
+        latents = editor.encode(recorded)
+        assert latents.equal(editor.encode(recorded.points))
+        range_m = editor.pixels(recorded.points).range_m
+        result = editor.inpaint(recorded.points, MASK, 1)
+        assert result.range_m[0][~MASK].equal(range_m[~MASK])
+        assert (result.labels[0] > 0)[MASK].equal(result.range_m[0][MASK] > 0)
+        assert len(result.intensity[0][MASK & (result.range_m[0] > 0)].unique()) > 2
 
     def test_results_have_those_of_the_scan_outside_the_mask(self, labelled, recorded):
         scan = labelled.pixels(recorded)

@@ -4,12 +4,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 from tiny_stages import QUIET, SENSOR, STAGES, TinyData, stage_module, tiny_sit, train
 
-from r3dpa.checkpoints import read_checkpoint
+from r3dpa.checkpoints import (
+    Checkpoint,
+    NetworkState,
+    load_into,
+    read_checkpoint,
+    with_further_channels,
+    without_further_channels,
+)
 from r3dpa.geometry import NUM_CLASSES, RangeCodec, ScanGeometry, SphericalProjection
 from r3dpa.losses import centred_features, class_errors, masked_mean, return_loss
 from r3dpa.modules import LossWeights, OptimizerConfig, VAEAlignment
@@ -126,28 +134,71 @@ def test_only_the_decoder_sees_noisy_latents():
     assert torch.equal(*means)
 
 
-def test_the_shipped_weights_start_a_vae_with_intensity_and_class():
+LABELS = {"intensity": True, "num_classes": NUM_CLASSES}
+DECODED = LABELS | {"encode_further": False}
+
+
+def vae_checkpoint(vae, arguments, codec):
+    geometry = ScanGeometry(SphericalProjection(SENSOR), codec, (2, 4)).to_dict()
+    networks = {"vae": NetworkState.of(vae, arguments)}
+    return Checkpoint(Path("before"), "vae_alignment", networks, geometry=geometry)
+
+
+@pytest.mark.parametrize(
+    ("there", "here"),
+    [({}, LABELS), (DECODED, LABELS), (DECODED, {})],
+    ids=["ranges to labels", "labels to the encoder too", "labels to ranges"],
+)
+def test_a_vae_with_other_channels_keeps_latents_ranges_and_returns(there, here):
+    arguments = {"in_channels": 2, "channels": 32, "channel_multipliers": (1,), "strides": ()}
+    before, after = (VAE(**arguments, **further) for further in (there, here))
+    codecs = [LabelledData.codec if further else RangeData.codec for further in (there, here)]
+    given = vae_checkpoint(before, arguments | there, codecs[0])
+    change = with_further_channels if here else without_further_channels
+    found = change(given, after)
+    load_into({"vae": after}, found, stage="joint")
+    assert ScanGeometry.from_dict(found.geometry).codec == codecs[1]
+    assert found.network("vae").build().image_channels == after.image_channels
+    image = torch.rand(1, 4, 8, 16)
+    with torch.no_grad():
+        latents = after.encode(image).mean
+        assert torch.equal(latents, before.encode(image).mean)
+        assert torch.equal(after.predict(latents)[:, :2], before.predict(latents)[:, :2])
+
+
+def test_what_an_encoder_has_learned_of_intensity_and_class_is_not_left_out():
+    arguments = {"in_channels": 2, "channels": 32, "channel_multipliers": (1,), "strides": ()}
+    before = VAE(**arguments, **LABELS)
+    given = vae_checkpoint(before, arguments | LABELS, LabelledData.codec)
+    after = VAE(**arguments)
+    assert without_further_channels(given, after) is given
+    with pytest.raises(ValueError, match=r"encoder\.further_in"):
+        load_into({"vae": after}, given, stage="joint")
+
+
+@pytest.mark.parametrize("further", [LABELS, {}], ids=["labels", "ranges"])
+def test_the_shipped_weights_start_a_vae_with_and_without_intensity_and_class(further):
     shipped = read_checkpoint("r3dpa-s")
-    plain = shipped.network("vae").build()
-    further = {"intensity": True, "num_classes": NUM_CLASSES}
+    before = shipped.network("vae").build()
     arguments = shipped.network("ema").arguments
     del arguments["average_blocks"]
     sit = SiT(**{**arguments, "depth": 6})
+    plain = {"intensity": False, "num_classes": 0, "encode_further": True}
     module = VAEAlignment(
-        VAE(**{**shipped.network("vae").arguments, **further}),
+        VAE(**{**shipped.network("vae").arguments, **plain, **further}),
         sit,
         init_from="r3dpa-s",
         init_networks=["vae", "latent_norm"],
     )
     module.load_previous_stage()
     recorded = ScanGeometry.from_dict(module._previous_geometry)
-    assert recorded.codec == LabelledData.codec
+    assert recorded.codec == (LabelledData if further else RangeData).codec
     assert module.latent_norm.fitted
     image = torch.rand(1, 4, 16, 64)
     with torch.no_grad():
-        latents = plain.encode(image[:, :2]).mean
-        assert torch.equal(module.vae.encode(image).mean, latents)
-        assert torch.equal(module.vae.predict(latents)[:, :6], plain.predict(latents))
+        latents = before.encode(image).mean
+        assert torch.equal(module.vae.encode(image[:, : 4 if further else 2]).mean, latents)
+        assert torch.equal(module.vae.predict(latents)[:, :6], before.predict(latents)[:, :6])
 
 
 def test_images_of_another_codec_are_refused():
