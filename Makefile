@@ -194,7 +194,7 @@ r3dpa-s-rgb: $(READY) ## VAE and flow from an RGB prior, in the hours of both wi
 	$(RGB_STAGE) --config conf/experiment/image_vae.yaml --trainer.max_steps 500 \
 		--data.init_args.num_workers 0 --run_dir $(SECOND)/image_vae
 	$(RGB_STAGE) --config conf/experiment/rgb_pretraining.yaml \
-		--model.init_args.sit conf/r3dpa_s_2/sit.yaml --config conf/r3dpa_s_2/rgb_prior.yaml \
+		--model.init_args.sit conf/r3dpa_s/sit.yaml --config conf/r3dpa_s_2/rgb_prior.yaml \
 		--run_dir $(SECOND)/rgb_prior --model.init_args.init_from $(SECOND)/image_vae/checkpoints/last.ckpt
 	$(FIT_SECOND) $(SECOND_ALIGNED) --config conf/r3dpa_s_2/vae_alignment.yaml \
 		--config conf/r3dpa_s_2/vae_rgb.yaml --run_dir $(SECOND)/rgb_vae \

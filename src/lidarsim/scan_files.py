@@ -106,7 +106,7 @@ def read_beside(scan: str | Path, kind: Literal["labels", "origins"]) -> np.ndar
     uint8, see :class:`lidarsim.Origin`. ``ScanError`` if the file is of another length
     than the scan.
     """
-    scan = Path(scan)
+    scan = Path(scan).absolute()  # of a name alone, the folders above it
     suffix, dtype = {"labels": (".label", "<u4"), "origins": (".origin", "u1")}[kind]
     path = scan.parents[1] / kind / f"{scan.stem}{suffix}"
     if scan.parts[-3:-1] != ("velodyne_points", "data") or not path.exists():

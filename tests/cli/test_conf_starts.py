@@ -47,6 +47,7 @@ R3DPA_S = {  # in the order given
     "trained": ("data", "vae_alignment"),
     "more": ("data", "vae_alignment", "vae_more"),
     "decoder": ("data", "vae_alignment", "vae_decoder"),
+    "decoder_labels": ("vae_alignment", "decoder_labels"),
     "flow": ("data", "flow_matching"),
     "few_step": ("data", "flow_matching", "few_step"),
     "demo": ("demo_data", "vae_alignment", "demo_vae"),
@@ -93,7 +94,7 @@ def test_no_file_is_left_out():
     started |= {
         f"r3dpa_s_2/{name}"
         for names in R3DPA_S_2.values()
-        for name in (*names, "data", "vae", "sit", "trainer")
+        for name in (*names, "data", "vae", "trainer")
     }
     elsewhere = set(" ".join(ELSEWHERE.values()).split())
     assert files == started | elsewhere
@@ -179,8 +180,8 @@ def test_experiments_with_tiny_networks(experiment, data, start, smoke_root, tmp
 def small_r3dpa_s(edition, grid_size):
     """Arguments of the networks of an edition for images of 16 x 64, and settings of these."""
     vae, sit = (
-        yaml.safe_load((CONF / edition / f"{part}.yaml").read_text())["init_args"]
-        for part in ("vae", "sit")
+        yaml.safe_load((CONF / f"{part}.yaml").read_text())["init_args"]
+        for part in (f"{edition}/vae", "r3dpa_s/sit")
     )
     sit["input_size"] = [2, 4]
     settings = {
@@ -206,8 +207,10 @@ def test_r3dpa_s_and_its_demo_start(name, start, smoke_root, tmp_path):
         codec = RangeCodec("log2", return_channel=True)
         exported = None if name == "flow" else sit
         settings |= start_flow(tmp_path, vae, (16, 64), exported, codec)
-    configs = ["trainer", *(f"r3dpa_s/{part}" for part in ("trainer", *given))]
-    start(configs, settings)
+    configs = [f"r3dpa_s/{part}" for part in ("trainer", *given)]
+    if name == "decoder_labels":
+        configs = ["r3dpa_s_2/trainer", "r3dpa_s_2/data", *configs[1:]]
+    start(["trainer", *configs], settings)
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from tiny_labelled import labelled_checkpoint
 from tiny_networks import GEOMETRY, tiny_checkpoint
 
 from lidarsim import simulate
@@ -14,9 +15,11 @@ from lidarsim.clouds import read_cloud
 from r3dpa import viz
 from r3dpa.cli import edit_session, main
 from r3dpa.data import read_scan, write_bin, write_npz, write_ply
+from r3dpa.data.labels import read_labels
 from r3dpa.editing import SceneEditor
 from r3dpa.geometry import (
     points_of,
+    project_pixels,
     range_image,
 )
 
@@ -117,6 +120,23 @@ class TestFiles:
         # A second edit leaves nothing of the first.
         edit(files, "vary", tmp_path / "again", "--scan", files / "a.bin", "--overwrite")
         assert not (tmp_path / "again" / "mask.png").exists()
+
+    def test_labels_beside_a_scan_stay_outside_of_the_mask(self, files, no_sheet, tmp_path):
+        labelled_checkpoint(tmp_path)
+        path = sorted((files / "data").rglob("data/*.bin"))[0]
+        box = ["--scan", path, "--box", "-40", "40", "-20", "0"]
+        edit(tmp_path, "inpaint", tmp_path / "o", *box, num=1, ckpt="labelled")
+        points = torch.from_numpy(read_scan(path))
+        labels = torch.from_numpy(read_labels(path, len(points)))
+        before = project_pixels(points, PROJECTION, labels)
+        after = project_pixels(
+            torch.from_numpy(read_scan(tmp_path / "o/bin/000000.bin")),
+            PROJECTION,
+            torch.from_numpy(np.fromfile(tmp_path / "o/labels/000000.label", "<u4").astype(int)),
+        )
+        kept = torch.from_numpy(np.asarray(Image.open(tmp_path / "o/mask.png")) == 0)
+        assert (before.classes[kept] >= 0).any()
+        assert torch.equal(after.classes[kept], before.classes[kept])
 
     def test_named_columns_of_a_scan(self, files, no_sheet, tmp_path):
         points = read_scan(files / "a.bin")

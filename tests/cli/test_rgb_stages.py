@@ -113,11 +113,12 @@ def test_vae_alignment_starts_from_an_rgb_model(rgb, smoke_args, tmp_path, caplo
 def test_the_prior_of_r3dpa_s_has_the_blocks_of_its_sit(image_vae, tmp_path):
     folder = CONF / "r3dpa_s_2"
     configs = ("trainer", "r3dpa_s_2/trainer", "data/dead_leaves", "experiment/rgb_pretraining")
-    prior = {"model.init_args.sit": folder / "sit.yaml", "config": folder / "rgb_prior.yaml"}
+    sit_file = CONF / "r3dpa_s/sit.yaml"
+    prior = {"model.init_args.sit": sit_file, "config": folder / "rgb_prior.yaml"}
     start = {"model.init_args.init_from": image_vae}
     size = {"model.init_args.sit.init_args.input_size": [8, 8]}
     path = fit(tmp_path, configs, prior, LEAVES, VAE, size, steps(1), start)
-    sit = SiT(**yaml.safe_load((folder / "sit.yaml").read_text())["init_args"])
+    sit = SiT(**yaml.safe_load(sit_file.read_text())["init_args"])
     rows = transfer_rgb(read_checkpoint(path), sit, LatentNorm(8), keep_projector=True)
     found = {row.group: row.result for row in rows}
     assert found.pop("pos_embed") == "resized"

@@ -23,6 +23,7 @@ from r3dpa.cli.parser import EditOptions
 from r3dpa.cli.scene_files import feature_source_of, provenance
 from r3dpa.data import PointSample, Scan, ScanError, pooled_grids
 from r3dpa.data.images import read_mask
+from r3dpa.data.labels import find_labels
 from r3dpa.data.scene_writer import SceneWriter
 from r3dpa.editing import EditResult, EditSettings, SceneEditor
 from r3dpa.editing.gaps import check_view, in_view
@@ -98,9 +99,11 @@ class EditSession:
         return self.editor.generator.sit
 
     def read(self, path: Path) -> ScanView:
-        """Read a scan, which must fill the field of view."""
+        """Read a scan, which must fill the field of view, and the labels beside it if any."""
         points = torch.from_numpy(read_scan(path, self.sensor, self.options.columns))
-        scan = ScanView(path, points, project_pixels(points, self.projection))
+        found = find_labels(path, len(points))
+        labels = None if found is None else torch.from_numpy(found)
+        scan = ScanView(path, points, project_pixels(points, self.projection, labels))
         self.check(scan)
         return scan
 

@@ -8,7 +8,7 @@ from typing import Any, Literal
 from jsonargparse.typing import NonNegativeInt, PositiveInt
 
 from r3dpa.cli.parser import ODESolver, SceneOptions, check_file
-from r3dpa.pretrained import DEFAULT_WEIGHTS
+from r3dpa.pretrained import DEFAULT_WEIGHTS, OBJECTS_SUFFIX, weights_file
 
 
 def sample(
@@ -164,7 +164,8 @@ def gallery(
     """Write one page of scenes in order, none left out, with clouds to turn.
 
     The nearest training scan beside each scene shows what is memorised. Edits of the first scene
-    follow, and fog, rain and snow in it.
+    follow, with a car put into it where the weights have features of objects, and fog, rain and
+    snow in it.
 
     Args:
         out: HTML file to write.
@@ -181,6 +182,7 @@ def gallery(
 
     from r3dpa.cli.features import read_data
     from r3dpa.editing import SceneEditor, regions
+    from r3dpa.editing.objects import ObjectLibrary
     from r3dpa.generation import SceneGenerator
     from r3dpa.io import usable_device, write_text
     from r3dpa.viz.gallery import gallery_page
@@ -194,17 +196,24 @@ def gallery(
             raise ValueError(f"{data}: is of another sensor than {ckpt}: {module.sensor}")
     projection = generator.geometry.projection
     editor = SceneEditor(generator, batch_size=batch_size)
+    objects = weights_file(ckpt).with_suffix(OBJECTS_SUFFIX)
+    car = ObjectLibrary.load(objects).feature("car") if objects.is_file() else None
 
     def edit(scene_m: Tensor) -> dict[str, Tensor]:
         """Results ``(N, H, W)`` of edits of a scene, by what they show."""
         street_ahead = regions.angle_box(projection, -30, 30, -25, 3)
         kept_rows = range(0, projection.sensor.beams, 2)
         missing = regions.dropped_beams(projection, kept_rows)
-        return {
+        results = {
             "ahead generated anew": editor.inpaint(scene_m, street_ahead, 2, seed).range_m,
             "every other beam filled": editor.complete(scene_m, missing, 1, seed).range_m,
             "varied": editor.vary(scene_m, 2, seed).range_m,
         }
+        if car is not None:
+            place = regions.box3d(projection, (10.0, 0.0, -0.95), (4.2, 1.8, 1.5))
+            made = editor.inpaint(scene_m, place, 2, seed, feature=car)
+            results["a car 10 m ahead"] = made.range_m
+        return results
 
     page = gallery_page(generator, str(ckpt), num, edit, module, seed, batch_size)
     html = page.html("r3dpa gallery")

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from lidarsim import Semantic
 from lidarsim.weather import Weather
 from r3dpa.geometry import Projection, points_of, range_image
 from r3dpa.metrics.nearest import nearest_images
 from r3dpa.viz.page import PageScan, Tile, scan_page
 from r3dpa.viz.pictures import range_image_picture
+from r3dpa.viz.scenes import categories
 
 if TYPE_CHECKING:
     from r3dpa.data import LidarDataModule
@@ -40,21 +43,33 @@ class GalleryPage:
         self.about: list[str] = []  # lines on top of the page
 
     def add(
-        self, group: str, name: str, range_m: Tensor, note: str = "", nearest: Tensor | None = None
+        self,
+        group: str,
+        name: str,
+        range_m: Tensor,
+        note: str = "",
+        nearest: Tensor | None = None,
+        labels: Tensor | None = None,
     ) -> None:
-        """Add a range image ``(H, W)`` in metres and the scan beside it, unless it is empty."""
+        """Add a range image ``(H, W)`` in metres and the scan beside it, unless it is empty.
+
+        ``labels`` are ``(P,)``, one for each return.
+        """
         if not (range_m > 0).any():  # neither empty nor NaN
             return
         images = {"scene": range_m} if nearest is None else {"scene": range_m, "nearest": nearest}
         sensor = self.projection.sensor
         strips = {key: range_image_picture(image, sensor) for key, image in images.items()}
         self.tiles.setdefault(group, []).append(Tile(len(self.scans), note, strips))
-        self.scans.append(PageScan(name, points_of(range_m, self.projection).numpy()))
+        points = points_of(range_m, self.projection).numpy()
+        numbers = None if labels is None else labels.numpy().astype(np.uint32)
+        self.scans.append(PageScan(name, points, numbers))
 
     def html(self, title: str) -> str:
         """Return the page."""
         sensor = self.projection.sensor
-        return scan_page(self.scans, title, {}, {}, None, sensor, self.tiles, self.about)
+        classes = categories(Semantic)
+        return scan_page(self.scans, title, classes, {}, None, sensor, self.tiles, self.about)
 
 
 def gallery_page(
@@ -82,12 +97,15 @@ def gallery_page(
     firsts = tqdm(range(0, num, batch_size), "scenes", unit="batch", disable=None)
     batches = [generator.generate(range(f, min(f + batch_size, num)), seed) for f in firsts]
     scenes_m = torch.cat([batch.range_m.cpu() for batch in batches])
+    labels = [
+        None if scene.labels is None else scene.point_labels for batch in batches for scene in batch
+    ]
     page.about.append(f"{source}: {num} scenes in seed order, {batches[0].nfe} evaluations each.")
     if data is None:
         for number, range_m in enumerate(scenes_m):
-            page.add("Scenes", f"seed {number}", range_m)
+            page.add("Scenes", f"seed {number}", range_m, labels=labels[number])
     else:
-        page.about.append(_add_with_nearest(page, scenes_m, data))
+        page.about.append(_add_with_nearest(page, scenes_m, labels, data))
     for name, results_m in edit(scenes_m[0]).items():
         for range_m in results_m:
             page.add("Edits of seed 0", name, range_m)
@@ -98,7 +116,9 @@ def gallery_page(
     return page
 
 
-def _add_with_nearest(page: GalleryPage, scenes_m: Tensor, data: LidarDataModule) -> str:
+def _add_with_nearest(
+    page: GalleryPage, scenes_m: Tensor, labels: Sequence[Tensor | None], data: LidarDataModule
+) -> str:
     """Add scenes beside their nearest training scans; return the median distances as a line."""
     held_out_m = next(data.val_set.ranges_m(len(scenes_m)), scenes_m[:0])
     references = data.train_set.ranges_m(256)
@@ -107,7 +127,7 @@ def _add_with_nearest(page: GalleryPage, scenes_m: Tensor, data: LidarDataModule
     for number, range_m in enumerate(scenes_m):
         note = f"nearest training scan at {distance[number]:.2f}"
         beside = data.train_set.range_m(int(nearest[number]))
-        page.add("Scenes", f"seed {number}", range_m, note, beside)
+        page.add("Scenes", f"seed {number}", range_m, note, beside, labels[number])
     of_scenes, of_held_out = distance.split([len(scenes_m), len(held_out_m)])
     return (
         f"Median distance to the nearest of {len(data.train_set)} training scans: "

@@ -120,13 +120,14 @@ def write_page(
 
     ``origins`` are further ones; ``options`` go to :func:`r3dpa.viz.scan_page`.
     """
-    made_by = _categories(Origin) | dict(origins or {})
-    page = scan_page(scans, title, _categories(Semantic), made_by, **options)
+    made_by = categories(Origin) | dict(origins or {})
+    page = scan_page(scans, title, categories(Semantic), made_by, **options)
     write_text(path, page)
     return path
 
 
-def _categories(names: type[IntEnum]) -> dict[int, Category]:
+def categories(names: type[IntEnum]) -> dict[int, Category]:
+    """Categories of classes or origins by number, in their colours."""
     return {
         int(member): Category(member.name.lower().replace("_", " "), COLOURS.get(member.name))
         for member in names
