@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from matplotlib.colors import to_rgb
 from PIL import Image
 from tiny_labelled import labelled_checkpoint
 from tiny_networks import tiny_checkpoint
 
+from lidarsim import Semantic
 from lidarsim.scan_files import read_npz, read_points, read_scan
 from r3dpa.checkpoints import convert
 from r3dpa.cli import main
@@ -25,6 +27,7 @@ from r3dpa.geometry import (
     points_of,
 )
 from r3dpa.io import source_commit
+from r3dpa.viz.scenes import COLOURS
 
 SENSOR = LidarSensor(beams=16, columns=64)  # of conf/smoke.yaml
 
@@ -113,6 +116,11 @@ class TestSample:
             assert np.array_equal(labels, scenes.point_labels(index).numpy())
             np.testing.assert_allclose(points[:, 3], scenes.point_intensity(index), atol=1e-5)
         assert (tmp_path / "out" / "scenes.html").exists()
+        with Image.open(tmp_path / "out" / "classes.png") as picture:
+            names = {Semantic(int(each)).name for each in scenes[0].point_labels.unique()}
+            wanted = {tuple(round(255 * part) for part in to_rgb(COLOURS[name])) for name in names}
+            found = {colour for _, colour in picture.convert("RGB").getcolors(1 << 20)}
+            assert wanted <= found
 
     def test_metadata_is_enough_to_repeat_the_run(self, scenes, tiny_file):
         metadata = json.loads((scenes / "metadata.json").read_text())
