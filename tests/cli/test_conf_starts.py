@@ -47,7 +47,6 @@ R3DPA_S = {  # in the order given
     "trained": ("data", "vae_alignment"),
     "more": ("data", "vae_alignment", "vae_more"),
     "decoder": ("data", "vae_alignment", "vae_decoder"),
-    "decoder_labels": ("vae_alignment", "decoder_labels"),
     "flow": ("data", "flow_matching"),
     "few_step": ("data", "flow_matching", "few_step"),
     "demo": ("demo_data", "vae_alignment", "demo_vae"),
@@ -57,7 +56,9 @@ R3DPA_S_2 = {
     "vae": ("vae_alignment",),
     "vae_rgb": ("teacher", "vae_alignment", "vae_rgb"),
     "decoder": ("vae_alignment", "vae_decoder"),
+    "decoder_labels": ("vae_alignment", "decoder_labels"),
     "flow": ("teacher", "flow_matching"),
+    "aligned": ("teacher", "flow_matching", "aligned"),
     "readout": ("teacher", "flow_matching", "readout"),
     "joint": ("teacher", "joint"),
     "few_step": ("teacher", "flow_matching", "few_step"),
@@ -207,10 +208,8 @@ def test_r3dpa_s_and_its_demo_start(name, start, smoke_root, tmp_path):
         codec = RangeCodec("log2", return_channel=True)
         exported = None if name == "flow" else sit
         settings |= start_flow(tmp_path, vae, (16, 64), exported, codec)
-    configs = [f"r3dpa_s/{part}" for part in ("trainer", *given)]
-    if name == "decoder_labels":
-        configs = ["r3dpa_s_2/trainer", "r3dpa_s_2/data", *configs[1:]]
-    start(["trainer", *configs], settings)
+    configs = ["trainer", *(f"r3dpa_s/{part}" for part in ("trainer", *given))]
+    start(configs, settings)
 
 
 @pytest.mark.parametrize(
@@ -226,6 +225,8 @@ def test_the_second_edition_of_r3dpa_s_starts(name, start, tmp_path):
         )
     if name.startswith("vae"):
         vae = {key: value for key, value in vae.items() if key not in ("intensity", "num_classes")}
+    if name in ("decoder_labels", "aligned"):
+        vae["encode_further"] = False
     channels = {} if name.startswith("vae") else {"intensity_channel": True, "num_classes": 15}
     codec = RangeCodec("log2", return_channel=True, **channels)
     settings |= start_flow(tmp_path, vae, (16, 64), sit, codec)
