@@ -33,7 +33,7 @@ endif
 FIT := $(BIN)/r3dpa fit --config conf/trainer.yaml --config conf/r3dpa_s/trainer.yaml $(SOURCE)
 endif
 # The long training of r3dpa-s; the same command continues an interrupted run. The shipped weights are
-# of r3dpa-s-first, then trained on by r3dpa-s-more.
+# of the first edition, which has other streets and whose SiT was not aligned.
 SECOND := runs/r3dpa_s_2
 FIT_SECOND := OMP_NUM_THREADS=1 nice -n 19 $(BIN)/r3dpa fit --config conf/trainer.yaml \
 	--config conf/r3dpa_s_2/trainer.yaml --ckpt_path last
@@ -180,7 +180,7 @@ r3dpa-s: $(READY) ## train the second edition of r3dpa-s: 20 hours of a core; st
 	$(BIN)/r3dpa data objects --data conf/r3dpa_s_2/data.yaml --ckpt $(SECOND)/r3dpa-s.safetensors \
 		--out $(SECOND)/r3dpa-s.objects
 
-r3dpa-s-more: $(READY) ## train the weights of the package on: labels, alignment, few steps; five hours of a core
+r3dpa-s-more: $(READY) ## train the weights of the package on, in five hours of a core: labels, alignment, few steps
 	OMP_NUM_THREADS=1 nice -n 19 $(BIN)/r3dpa data prepare $(SECOND_ALIGNED)
 	$(FIT_SECOND) $(SECOND_DATA) --config conf/r3dpa_s_2/vae_alignment.yaml \
 		--config conf/r3dpa_s_2/decoder_labels.yaml --run_dir $(SECOND)/labels
