@@ -98,8 +98,11 @@ def with_further_channels(checkpoint: Checkpoint, vae: VAE) -> Checkpoint:
     checkpoint lacks no such layer.
     """
     weights = checkpoint.network("vae").state_dict
-    own = vae.state_dict()
-    layers = {key: own[key] for key in own.keys() - weights.keys() if ".further_" in key}
+    layers = {
+        key: value
+        for key, value in vae.state_dict().items()
+        if ".further_" in key and key not in weights
+    }
     return _with_channels_of(checkpoint, vae, {**weights, **layers}) if layers else checkpoint
 
 

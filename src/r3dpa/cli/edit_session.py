@@ -101,8 +101,8 @@ class EditSession:
     def read(self, path: Path) -> ScanView:
         """Read a scan, which must fill the field of view, and the labels beside it if any."""
         points = torch.from_numpy(read_scan(path, self.sensor, self.options.columns))
-        found = find_labels(path, len(points))
-        labels = None if found is None else torch.from_numpy(found)
+        known = find_labels(path, len(points))
+        labels = None if known is None else torch.from_numpy(known)
         scan = ScanView(path, points, project_pixels(points, self.projection, labels))
         self.check(scan)
         return scan

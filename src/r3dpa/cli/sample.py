@@ -211,8 +211,8 @@ def gallery(
         }
         if car is not None:
             place = regions.box3d(projection, (10.0, 0.0, -0.95), (4.2, 1.8, 1.5))
-            made = editor.inpaint(scene_m, place, 2, seed, feature=car)
-            results["a car 10 m ahead"] = made.range_m
+            with_car = editor.inpaint(scene_m, place, 2, seed, feature=car)
+            results["a car 10 m ahead"] = with_car.range_m
         return results
 
     page = gallery_page(generator, str(ckpt), num, edit, module, seed, batch_size)
