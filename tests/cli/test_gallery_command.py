@@ -2,11 +2,17 @@
 
 import json
 import re
+from dataclasses import replace
 
 import pytest
+import torch
+from tiny_labelled import labelled_checkpoint
 
+from lidarsim import Semantic
 from r3dpa import SceneGenerator
+from r3dpa.checkpoints import read_checkpoint, save_checkpoint
 from r3dpa.cli import main
+from r3dpa.editing.objects import ObjectClass, ObjectLibrary
 from r3dpa.geometry import points_of
 
 
@@ -18,14 +24,18 @@ def data_file(folder, num_scans, **sensor):
     return path
 
 
+def content(page):
+    text = page.read_text()
+    return json.loads(re.search(r'type="application/json"[^>]*>(.*?)</script>', text)[1])
+
+
 @pytest.fixture(scope="module")
 def page(tiny_file, tmp_path_factory):
     out = tmp_path_factory.mktemp("gallery") / "gallery.html"
     data = data_file(out.parent, 10, beams=16, columns=64)
     words = ["--ckpt", tiny_file, "--out", out, "--num", 3, "--batch_size", 2, "--data", data]
     main(["gallery", *map(str, words), "--quality", "draft", "--device", "cpu"])
-    text = out.read_text()
-    return json.loads(re.search(r'type="application/json"[^>]*>(.*?)</script>', text)[1])
+    return content(out)
 
 
 def test_every_scene_is_on_the_page_in_order(page, tiny_file):
@@ -51,3 +61,24 @@ def test_data_of_another_sensor_are_refused(tiny_file, tmp_path):
     data = data_file(tmp_path, 2, beams=8, columns=64)
     with pytest.raises(ValueError, match=r"data\.yaml: is of another sensor"):
         main(["gallery", "--ckpt", str(tiny_file), "--out", "g.html", "--data", str(data)])
+
+
+def test_classes_and_a_car_where_the_weights_have_them(tmp_path):
+    path = labelled_checkpoint(tmp_path)
+    checkpoint = replace(read_checkpoint(path), feature_source="geometric")
+    save_checkpoint(checkpoint, path, overwrite=True)
+    dim = checkpoint.network("ema").build().feature_dim
+    car = ObjectLibrary(
+        torch.ones(1, dim), (ObjectClass("car", 1, 1, 1, 0.0),), {"name": "geometric"}, {}, (2, 8)
+    )
+    car.save(path.with_suffix(".objects"))
+    words = ["--ckpt", path, "--num", 1, "--out", tmp_path / "g.html", "--quality", "draft"]
+    main(["gallery", *map(str, words), "--device", "cpu"])
+    made = content(tmp_path / "g.html")
+    groups = {group["title"]: group["tiles"] for group in made["film"]["groups"]}
+    edits = [made["scans"][tile["scan"]]["name"] for tile in groups["Edits of seed 0"]]
+    assert edits.count("a car 10 m ahead") == 2
+    assert len(made["categories"]["semantic"]) > 1
+    assert {name for _, name, _ in made["categories"]["semantic"]} <= {
+        member.name.lower().replace("_", " ") for member in Semantic
+    }

@@ -3,14 +3,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from matplotlib.colors import to_rgb
 from matplotlib.contour import ContourSet
 from matplotlib.figure import Figure
 from PIL import Image
 
 from r3dpa import viz
-from r3dpa.geometry import LidarSensor, SphericalProjection
+from r3dpa.geometry import LidarSensor, RingProjection, SphericalProjection, values_at_returns
 from r3dpa.viz.figures import ERROR_MAP, ONLY_INPUT, ONLY_RECONSTRUCTION
 from r3dpa.viz.pictures import BACKGROUND, CAMERA_EYE_M, CAMERA_TARGET_M
+from r3dpa.viz.scenes import COLOURS, classes_sheet
 
 SENSOR = LidarSensor(beams=8, columns=32)
 BLUE, RED, GREEN = np.eye(3)[[2, 0, 1]]
@@ -134,6 +136,26 @@ def test_scenes_sheet_has_a_row_of_three_pictures_per_scene():
     boxes = [axes.get_tightbbox() for axes in figure.axes]
     overlaps = [a for i, a in enumerate(boxes) for b in boxes[:i] if a.overlaps(b)]
     assert not overlaps
+
+
+@pytest.mark.parametrize("kind", [SphericalProjection, RingProjection])
+def test_classes_sheet_shows_the_class_of_each_return_in_its_pixel(kind):
+    inclinations_deg = tuple(np.linspace(2.0, -24.0, SENSOR.beams))
+    projection = kind(SENSOR, inclinations_deg) if kind is RingProjection else kind(SENSOR)
+    random = torch.Generator().manual_seed(0)
+    size = SENSOR.beams, SENSOR.columns
+    range_m = torch.where(torch.rand(size, generator=random) > 0.3, 5.0, -1.0)
+    image = torch.tensor([7, 21, 26])[torch.randint(3, size, generator=random)]  # road, leaves, car
+    labels = values_at_returns(image, range_m, projection).numpy().astype(np.uint32) | 5 << 16
+    figure = classes_sheet([(range_m, labels)], projection)
+    shown = [axes for axes in figure.axes if axes.images][1].images[0].get_array()
+    names = {7: "ROAD", 21: "VEGETATION", 26: "CAR"}
+    for (row, column), number in np.ndenumerate(image.numpy()):
+        known = (range_m[row, column] > 0).item()
+        colour = to_rgb(COLOURS[names[number]]) if known else (0, 0, 0)
+        assert np.allclose(shown[row, column] / 255, colour, atol=0.01)
+    entries = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert entries == ["road", "vegetation", "car"]
 
 
 @pytest.mark.parametrize(("count", "cells"), [(1, 1), (5, 6)])

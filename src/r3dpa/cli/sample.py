@@ -164,8 +164,8 @@ def gallery(
     """Write one page of scenes in order, none left out, with clouds to turn.
 
     The nearest training scan beside each scene shows what is memorised. Edits of the first scene
-    follow, with a car put into it where the weights have features of objects, and fog, rain and
-    snow in it.
+    follow, with a car put into it where the weights have features of cars, and fog, rain and snow
+    in it.
 
     Args:
         out: HTML file to write.
@@ -180,15 +180,23 @@ def gallery(
     """
     from torch import Tensor
 
+    from r3dpa.checkpoints import read_checkpoint
     from r3dpa.cli.features import read_data
     from r3dpa.editing import SceneEditor, regions
     from r3dpa.editing.objects import ObjectLibrary
     from r3dpa.generation import SceneGenerator
     from r3dpa.io import usable_device, write_text
+    from r3dpa.scenes import Scene
     from r3dpa.viz.gallery import gallery_page
 
     check_file(out)
-    generator = SceneGenerator.from_checkpoint(ckpt, quality, device=usable_device(device))
+    checkpoint = read_checkpoint(ckpt)
+    generator = SceneGenerator.from_checkpoint(checkpoint, quality, device=usable_device(device))
+    car, objects = None, weights_file(ckpt).with_suffix(OBJECTS_SUFFIX)
+    if objects.is_file():
+        library = ObjectLibrary.load(objects)
+        library.check_source(checkpoint.feature_source, generator.sit.feature_dim)
+        car = library.feature("car") if "car" in library.names else None
     module = None if data is None else read_data(data)
     if module is not None:
         module.setup("fit")
@@ -196,22 +204,20 @@ def gallery(
             raise ValueError(f"{data}: is of another sensor than {ckpt}: {module.sensor}")
     projection = generator.geometry.projection
     editor = SceneEditor(generator, batch_size=batch_size)
-    objects = weights_file(ckpt).with_suffix(OBJECTS_SUFFIX)
-    car = ObjectLibrary.load(objects).feature("car") if objects.is_file() else None
 
-    def edit(scene_m: Tensor) -> dict[str, Tensor]:
+    def edit(scene: Scene) -> dict[str, Tensor]:
         """Results ``(N, H, W)`` of edits of a scene, by what they show."""
         street_ahead = regions.angle_box(projection, -30, 30, -25, 3)
         kept_rows = range(0, projection.sensor.beams, 2)
         missing = regions.dropped_beams(projection, kept_rows)
         results = {
-            "ahead generated anew": editor.inpaint(scene_m, street_ahead, 2, seed).range_m,
-            "every other beam filled": editor.complete(scene_m, missing, 1, seed).range_m,
-            "varied": editor.vary(scene_m, 2, seed).range_m,
+            "ahead generated anew": editor.inpaint(scene, street_ahead, 2, seed).range_m,
+            "every other beam filled": editor.complete(scene, missing, 1, seed).range_m,
+            "varied": editor.vary(scene, 2, seed).range_m,
         }
         if car is not None:
             place = regions.box3d(projection, (10.0, 0.0, -0.95), (4.2, 1.8, 1.5))
-            with_car = editor.inpaint(scene_m, place, 2, seed, feature=car)
+            with_car = editor.inpaint(scene, place, 2, seed, feature=car)
             results["a car 10 m ahead"] = with_car.range_m
         return results
 

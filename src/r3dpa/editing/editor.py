@@ -358,7 +358,8 @@ class SceneEditor:
                 "them by their full scale, such as 255"
             )
         pixels = map_pixels(lambda values: values.to(self.generator.device), pixels)
-        image = codec.first_channels(vae.encoded_channels).to_image(*pixels)
+        encoded = codec if vae.encode_further else codec.without_further()
+        image = encoded.to_image(*pixels)
         return self.generator.latent_norm.normalise(vae.encode(image).mean)
 
     def _result(

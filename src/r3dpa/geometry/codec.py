@@ -211,10 +211,8 @@ class RangeCodec:
         further = self.intensity_channel + (self.num_classes > 0)
         return 1 + (self.return_channel or self.reflectance) + further
 
-    def first_channels(self, num: int) -> Self:
-        """Codec of the first ``num`` channels: all, or range and return alone."""
-        if num == self.channels:
-            return self
+    def without_further(self) -> Self:
+        """Codec of the same images without intensity and class, their last channels."""
         return replace(self, intensity_channel=False, num_classes=0)
 
     def to_image(

@@ -265,11 +265,6 @@ class VAE(Autoencoder):
         """Channels of the images that it encodes and decodes."""
         return self.in_channels + self.intensity + (self.num_classes > 0)
 
-    @property
-    def encoded_channels(self) -> int:
-        """Channels of the images that its encoder looks at: the first ones."""
-        return self.image_channels if self.encode_further else self.in_channels
-
     def outputs_of(self, prediction: Tensor) -> PixelOutputs:
         """Parts of outputs ``(B, ..., H, W)`` of the decoder."""
         sizes = [

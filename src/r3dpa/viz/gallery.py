@@ -21,6 +21,7 @@ from r3dpa.viz.scenes import categories
 if TYPE_CHECKING:
     from r3dpa.data import LidarDataModule
     from r3dpa.generation import SceneGenerator
+    from r3dpa.scenes import Scene
 
 _WEATHERS = {
     "fog, 60 m": Weather(visibility_m=60),
@@ -76,7 +77,7 @@ def gallery_page(
     generator: SceneGenerator,
     source: str,
     num: int,
-    edit: Callable[[Tensor], Mapping[str, Tensor]],
+    edit: Callable[[Scene], Mapping[str, Tensor]],
     data: LidarDataModule | None = None,
     seed: int = 0,
     batch_size: int = 8,
@@ -87,7 +88,7 @@ def gallery_page(
         generator: Makes the scenes.
         source: Name of its weights, for the text.
         num: Number of scenes.
-        edit: Edits of a scene ``(H, W)``: results ``(N, H, W)`` by name.
+        edit: Edits of a scene: results ``(N, H, W)`` in metres by name.
         data: Training data, set up for a fit, whose nearest scans are shown; None shows none.
         seed: Scenes and edits depend on it.
         batch_size: Scenes made together.
@@ -96,17 +97,16 @@ def gallery_page(
     page = GalleryPage(projection)
     firsts = tqdm(range(0, num, batch_size), "scenes", unit="batch", disable=None)
     batches = [generator.generate(range(f, min(f + batch_size, num)), seed) for f in firsts]
-    scenes_m = torch.cat([batch.range_m.cpu() for batch in batches])
-    labels = [
-        None if scene.labels is None else scene.point_labels for batch in batches for scene in batch
-    ]
+    scenes = [scene for batch in batches for scene in batch]
+    scenes_m = torch.stack([scene.range_m.cpu() for scene in scenes])
+    labels = [None if scene.labels is None else scene.point_labels for scene in scenes]
     page.about.append(f"{source}: {num} scenes in seed order, {batches[0].nfe} evaluations each.")
     if data is None:
         for number, range_m in enumerate(scenes_m):
             page.add("Scenes", f"seed {number}", range_m, labels=labels[number])
     else:
         page.about.append(_add_with_nearest(page, scenes_m, labels, data))
-    for name, results_m in edit(scenes_m[0]).items():
+    for name, results_m in edit(scenes[0]).items():
         for range_m in results_m:
             page.add("Edits of seed 0", name, range_m)
     points = points_of(scenes_m[0], projection)

@@ -133,8 +133,8 @@ def scan_page(
             "intensity": _scale("intensity", INTENSITY_MAP, 0.5, [0, brightest / 4, brightest]),
         },
         "categories": {
-            "semantic": _category_rows(semantics, labels),
-            "origin": _category_rows(origins, made_by),
+            "semantic": category_rows(semantics, labels),
+            "origin": category_rows(origins, made_by),
         },
         "scans": [header for header, _ in packed],
         "shown": len(scans),
@@ -267,7 +267,7 @@ def _scale(label: str, colours: Colormap, power: float, ticks: Sequence[float]) 
     }
 
 
-def _category_rows(
+def category_rows(
     categories: Mapping[int, Category], used: Sequence[NDArray[np.integer]]
 ) -> list[tuple[int, str, str]]:
     """Number, name and colour of the categories that occur; missing colours from the palette."""

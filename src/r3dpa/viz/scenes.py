@@ -19,7 +19,7 @@ from lidarsim import Origin, Semantic
 from r3dpa.geometry import Projection, ScanGeometry, points_of
 from r3dpa.io import write_text
 from r3dpa.viz.figures import birds_eye_view, scenes_sheet, strip_sheet
-from r3dpa.viz.page import Category, PageScan, scan_page
+from r3dpa.viz.page import Category, PageScan, category_rows, scan_page
 from r3dpa.viz.pictures import as_bytes, range_image_picture, save, scene_3d
 
 # Colours that people expect (plants are green), and quiet ones for what is everywhere; a category
@@ -70,7 +70,6 @@ COLOURS = {
     "SECOND_RETURN": "#f78fb3",
 }
 _ON_SHEET, _ON_PAGE = 16, 8
-_UNKNOWN = "#8a8f98"  # classes without a colour of their own
 
 
 def draw_scene(out: Path, index: int, range_m: Tensor, geometry: ScanGeometry) -> None:
@@ -92,23 +91,15 @@ def draw_scenes(out: Path, range_path: Path, pictures: int, geometry: ScanGeomet
     for index, range_m in enumerate(drawn):
         draw_scene(out, index, range_m, geometry)
     save(scenes_sheet(drawn[:_ON_SHEET], geometry.projection), out / "scenes.png")
-    written = [_written_labels(out, index) for index in range(len(drawn))]
-    labelled = [
-        (range_m, labels)
-        for range_m, labels in zip(drawn, written, strict=True)
-        if labels is not None
-    ]
+    shown = [(image, _written_labels(out, index)) for index, image in enumerate(drawn[:_ON_PAGE])]
+    labelled = [(image, labels) for image, labels in shown if labels is not None]
     opened = f"open {out / 'scenes.png'}"
     if labelled:
-        sheet = classes_sheet(labelled[:_ON_PAGE], geometry.projection)
+        sheet = classes_sheet(labelled, geometry.projection)
         opened += f", {save(sheet, out / 'classes.png')}"
     scans = [
-        PageScan(
-            f"scene {index:06d}",
-            points_of(image, geometry.projection).numpy(),
-            written[index],
-        )
-        for index, image in enumerate(drawn[:_ON_PAGE])
+        PageScan(f"scene {index:06d}", points_of(image, geometry.projection).numpy(), labels)
+        for index, (image, labels) in enumerate(shown)
         if (image > 0).any()  # neither empty nor NaN
     ]
     if not scans:
@@ -124,24 +115,20 @@ def classes_sheet(scenes: Sequence[tuple[Tensor, NDArray]], projection: Projecti
         scenes: Range image ``(H, W)`` in metres, and the labels ``(P,)`` of its points.
         projection: Projection of the images.
     """
-    known = categories(Semantic)
-    columns, strips, present = projection.column_order(), [], set[int]()
-    for number, (range_m, labels) in enumerate(scenes):
-        classes, places = np.unique(labels & 0xFFFF, return_inverse=True)
-        present |= set(classes.tolist())
-        colours = np.array([to_rgb(known[each].colour or _UNKNOWN) for each in classes.tolist()])
-        colours = colours.reshape(-1, 3)  # of an empty scene too
-        turned = torch.zeros(*range_m.shape, 3, dtype=torch.float64)
-        turned[range_m[:, columns] > 0] = torch.from_numpy(colours[places])
-        picture = torch.empty_like(turned)
-        picture[:, columns] = turned
-        strips.append((f"scene {number}", range_image_picture(range_m, projection.sensor)))
-        strips.append((f"classes of scene {number}", as_bytes(picture.numpy())))
+    numbers = [labels & 0xFFFF for _, labels in scenes]
+    rows = category_rows(categories(Semantic), numbers)
+    colours = {number: to_rgb(colour) for number, _, colour in rows}
+    columns, strips = projection.column_order(), []
+    for index, ((range_m, _), classes) in enumerate(zip(scenes, numbers, strict=True)):
+        turned = np.zeros((*range_m.shape, 3))
+        of_returns = [colours[number] for number in classes.tolist()]
+        turned[(range_m[:, columns] > 0).numpy()] = np.reshape(of_returns, (-1, 3))
+        picture = np.empty_like(turned)
+        picture[:, columns.numpy()] = turned
+        strips.append((f"scene {index}", range_image_picture(range_m, projection.sensor)))
+        strips.append((f"classes of scene {index}", as_bytes(picture)))
     figure, _ = strip_sheet(strips, projection.sensor, below_in=0.5)
-    entries = [
-        Patch(color=known[each].colour or _UNKNOWN, label=known[each].name)
-        for each in sorted(present)
-    ]
+    entries = [Patch(color=colour, label=name) for _, name, colour in rows]
     figure.legend(handles=entries, loc="outside lower center", ncols=8, frameon=False)
     return figure
 
