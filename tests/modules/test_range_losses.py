@@ -15,6 +15,7 @@ from r3dpa.checkpoints import (
     NetworkState,
     load_into,
     read_checkpoint,
+    save_checkpoint,
     with_further_channels,
     without_further_channels,
 )
@@ -164,6 +165,17 @@ def test_a_vae_with_other_channels_keeps_latents_ranges_and_returns(there, here)
         latents = after.encode(image).mean
         assert torch.equal(latents, before.encode(image).mean)
         assert torch.equal(after.predict(latents)[:, :2], before.predict(latents)[:, :2])
+
+
+def test_a_run_of_ranges_starts_from_a_checkpoint_whose_decoder_has_labels(tmp_path):
+    arguments = {"in_channels": 2, "channels": 32, "channel_multipliers": (1,), "strides": ()}
+    before = VAE(**arguments, **DECODED)
+    given = vae_checkpoint(before, arguments | DECODED, LabelledData.codec)
+    path = save_checkpoint(given, tmp_path / "labels.safetensors")
+    module = VAEAlignment(VAE(**arguments), tiny_sit(), init_from=str(path), init_networks=["vae"])
+    module.load_previous_stage()
+    expected = before.state_dict()
+    assert all(torch.equal(value, expected[key]) for key, value in module.vae.state_dict().items())
 
 
 def test_what_an_encoder_has_learned_of_intensity_and_class_is_not_left_out():
