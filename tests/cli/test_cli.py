@@ -87,7 +87,7 @@ def test_usage_errors_name_the_word(words, message, capsys):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["convert", "no.pt", "x.pt"], "r3dpa convert: no.pt: no such file or folder"),
+        (["convert", "no.pt", "x.pt"], "r3dpa convert: no checkpoint file no.pt; give"),
         (["edit", "vary", "--scan", "f", "--out", "f"], "r3dpa edit vary: f is a f"),
         (
             ["fit", "jointly"],

@@ -237,9 +237,10 @@ def run_function(function: Callable[..., Any], words: Sequence[str], prog: str) 
 
 def _check_inputs(parser: Parser, arguments: Mapping[str, Any]) -> None:
     """Refuse files that do not exist, before torch is imported, which takes seconds."""
-    ckpt = arguments.get("ckpt")
-    if isinstance(ckpt, Path) and not str(ckpt).startswith("hf:/"):
-        weights_file(ckpt)
+    for name in ("ckpt", "decoder"):
+        ckpt = arguments.get(name)
+        if isinstance(ckpt, Path) and not str(ckpt).startswith("hf:/"):
+            weights_file(ckpt)
     options = {action.dest for action in parser._actions if action.option_strings}
     for name in _INPUTS:
         path = arguments.get(name)

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 
 def convert(
-    source: Path,
+    ckpt: Path,
     out: Path,
     *,
     to: Literal["r3dpa", "official"] = "r3dpa",
@@ -22,7 +22,8 @@ def convert(
     """Convert official checkpoints into ours, or ours into official ones.
 
     Args:
-        source: Official ``.pt``, Lightning ``.ckpt`` or exported ``.safetensors``.
+        ckpt: Official ``.pt``, Lightning ``.ckpt``, exported ``.safetensors``, or a name of
+            ``r3dpa models``.
         out: File to write, ``.safetensors`` for ours and ``.pt`` for the official layout.
         to: Layout of the result.
         overwrite: Replace ``out`` if it exists.
@@ -31,13 +32,13 @@ def convert(
         encoding: Official files only: range encoding, if the file lacks it.
         networks: Write these alone; sampling needs ``vae ema ema_latent_norm``.
         half: Write weights in float16, half as large.
-        decoder: Checkpoint whose VAE is taken in place of the source's. It must have the same
+        decoder: Checkpoint whose VAE is taken in place of that of ``ckpt``. It must have the same
             encoder, as after ``train_encoder: false``.
     """
     from r3dpa.checkpoints import convert as convert_checkpoint
 
     return convert_checkpoint(
-        source,
+        ckpt,
         out,
         to=to,
         overwrite=overwrite,
