@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
@@ -63,7 +63,8 @@ class FewStep(FlowMatching):
 
     Args:
         vae: Range-image autoencoder; fixed.
-        sit: SiT with a copy of its last blocks. The copy in ``init_from``, if any, is not used.
+        sit: SiT with a copy of its last blocks. Training starts from the copy in ``init_from``, if
+            it has one of as many blocks.
         thin_decoder: Decoder to distil; None trains none.
         trajectories: Number of trajectories, 16 evaluations each in the precision of the steps.
         **kwargs: See :class:`FlowMatching`. ``init_from`` is a checkpoint of stage flow_matching,
@@ -103,16 +104,19 @@ class FewStep(FlowMatching):
         self._cached: CachedTensors[_Noise] | None = None
 
     def previous_networks(self, before: Checkpoint) -> Checkpoint:
-        """The averaged flow as the networks of this stage, its last blocks copied."""
+        """The averaged flow as the networks of this stage, its last blocks copied once."""
         if before.interpolant != self.interpolant.path:
             raise ValueError(
                 f"{before.path} was trained on the {before.interpolant} path: set "
                 "--model.init_args.path to it"
             )
+        trained = _average_weights(before.network("ema").state_dict)
         before = super().previous_networks(before)
         flow = before.network("ema")
         networks = dict(before.networks) | {"latent_norm": before.network("ema_latent_norm")}
         weights = cast(AverageVelocitySiT, self.sit).with_average(flow.state_dict)
+        if trained.keys() == _average_weights(weights).keys():
+            weights |= trained
         networks["sit"] = replace(flow, state_dict=weights)
         return replace(before, networks=networks)
 
@@ -237,6 +241,10 @@ class FewStep(FlowMatching):
         num_decoded = math.ceil(world * len(latents) / _DECODED)  # of all processes
         weight = world * len(part) / num_decoded  # the mean over processes is one over the part
         return {name: weight * loss for name, loss in losses_of_part.items()}
+
+
+def _average_weights(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {key: value for key, value in weights.items() if key.startswith("average.")}
 
 
 def _check_thin_decoder(thin_decoder: ThinDecoder, vae: VAE) -> None:
