@@ -152,6 +152,8 @@ def convert(
     networks: Sequence[str] | None = None,
     half: bool = False,
     decoder: str | Path | None = None,
+    average_with: str | Path | None = None,
+    share: float = 0.5,
 ) -> str:
     """Convert a checkpoint of any layout to ours, or to the official one.
 
@@ -164,11 +166,13 @@ def convert(
         Files, networks and what was not converted, as text.
 
     Raises:
-        ValueError: If a network has no counterpart in the other layout, a file exists, or the VAE
-            of ``decoder`` has other latents.
+        ValueError: If a network has no counterpart in the other layout, a file exists, the VAE of
+            ``decoder`` or ``average_with`` has other latents, or ``share`` is not in [0, 1].
     """
     source, out = Path(source), Path(out)
     checkpoint = read_checkpoint(source, sit_args=sit_args, encoding=encoding)
+    if average_with is not None:
+        checkpoint = _averaged(checkpoint, read_checkpoint(average_with), share)
     if decoder is not None:
         checkpoint = _with_decoder_of(checkpoint, read_checkpoint(decoder))
     if networks is not None or half:
@@ -234,20 +238,57 @@ def _select_networks(
 
 def _with_decoder_of(checkpoint: Checkpoint, other: Checkpoint) -> Checkpoint:
     """Checkpoint with the VAE of ``other``, whose encoder must be its own, and its codec."""
-    vae = other.network("vae")
-    before, after = (
-        weights_sha256({k: v.float() for k, v in of.state_dict.items() if k.startswith(_ENCODER)})
-        for of in (checkpoint.network("vae"), vae)
-    )
-    if before != after:
-        raise ValueError(
-            f"{other.path} has another encoder than {checkpoint.path}, so other latents: give a "
-            "checkpoint of stage vae_alignment that started from it with train_encoder false"
-        )
+    _check_same_latents(checkpoint, other)
     geometry = checkpoint.geometry
     if geometry is not None and other.geometry is not None:
         geometry = {**geometry, "codec": other.geometry["codec"]}
-    return replace(checkpoint, networks={**checkpoint.networks, "vae": vae}, geometry=geometry)
+    networks = {**checkpoint.networks, "vae": other.network("vae")}
+    return replace(checkpoint, networks=networks, geometry=geometry)
+
+
+def _averaged(checkpoint: Checkpoint, other: Checkpoint, share: float) -> Checkpoint:
+    """Checkpoint whose flow has ``share`` of the weights of ``other``, in float32.
+
+    Weights that ``other`` lacks, such as those of average velocities, stay.
+
+    Source: Wortsman et al., "Robust fine-tuning of zero-shot models" (CVPR 2022).
+    """
+    if not 0 <= share <= 1:
+        raise ValueError(f"share must lie in [0, 1], got {share}")
+    _check_same_latents(checkpoint, other)
+    networks = dict(checkpoint.networks)
+    for name in {"sit", "ema"} & networks.keys() & other.networks.keys():
+        weights, others = networks[name].state_dict, other.networks[name].state_dict
+        shared = weights.keys() & others.keys()
+        for key in sorted(shared):
+            here, there = tuple(weights[key].shape), tuple(others[key].shape)
+            if here != there:
+                raise ValueError(
+                    f"{other.path} cannot be averaged with {checkpoint.path}: {name}.{key} has "
+                    f"shape {there} there and {here} here"
+                )
+        averaged = {k: weights[k].float().lerp(others[k].float(), share) for k in shared}
+        networks[name] = replace(networks[name], state_dict={**weights, **averaged})
+    return replace(checkpoint, networks=networks)
+
+
+def _check_same_latents(checkpoint: Checkpoint, other: Checkpoint) -> None:
+    """Refuse a checkpoint whose VAE has another encoder."""
+    here, there = (
+        weights_sha256(
+            {
+                key: value.float()
+                for key, value in of.network("vae").state_dict.items()
+                if key.startswith(_ENCODER)
+            }
+        )
+        for of in (checkpoint, other)
+    )
+    if here != there:
+        raise ValueError(
+            f"{other.path} has another encoder than {checkpoint.path}, so other latents: give a "
+            "checkpoint that started from it and kept its encoder (train_encoder: false)"
+        )
 
 
 def _refuse_existing(paths: list[Path], overwrite: bool) -> None:

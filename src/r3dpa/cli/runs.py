@@ -18,6 +18,8 @@ def convert(
     networks: list[str] | None = None,
     half: bool = False,
     decoder: Path | None = None,
+    average_with: Path | None = None,
+    share: float = 0.5,
 ) -> str:
     """Convert official checkpoints into ours, or ours into official ones.
 
@@ -34,6 +36,9 @@ def convert(
         half: Write weights in float16, half as large.
         decoder: Checkpoint whose VAE is taken in place of that of ``ckpt``. It must have the same
             encoder, as after ``train_encoder: false``.
+        average_with: Checkpoint with whose flow that of ``ckpt`` is averaged. Both must have the
+            same encoder, and one should have started from the other.
+        share: Share of the weights of ``average_with``, from 0 to 1.
     """
     from r3dpa.checkpoints import convert as convert_checkpoint
 
@@ -47,6 +52,8 @@ def convert(
         networks=networks,
         half=half,
         decoder=decoder,
+        average_with=average_with,
+        share=share,
     )
 
 
