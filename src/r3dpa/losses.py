@@ -19,7 +19,6 @@ __all__ = [
     "discriminator_loss",
     "flow_matching_loss",
     "generator_loss",
-    "gradient_matching_loss",
     "masked_mean",
     "pixel_error",
     "reconstruction_errors",
@@ -27,9 +26,6 @@ __all__ = [
     "return_loss",
     "unit_vectors",
 ]
-
-# Difference of encoded ranges from one column to the next: 2 % of the range in log2.
-_SAME_SURFACE = 0.01
 
 
 def reconstruction_loss(
@@ -76,28 +72,6 @@ def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
     """Mean ``(B,)`` of values ``(B, ...)`` where the mask is True; 0 where it is nowhere."""
     total = torch.where(mask, values, 0.0).flatten(1).sum(dim=1)
     return total / mask.flatten(1).sum(dim=1).clamp(min=1)
-
-
-def gradient_matching_loss(ranges: Tensor, image: Tensor, returns: Tensor) -> Tensor:
-    """Mean error ``(B,)`` of range differences along a ring, 1, 2, 4 and 8 columns apart.
-
-    Errors of neighbouring pixels that are each small still make a flat wall wavy. Pairs on two
-    surfaces, whose true ranges differ by 2 % of the range per column or more, do not count.
-
-    Source: Li and Snavely, "MegaDepth" (CVPR 2018), whose scales are of a pyramid.
-
-    Args:
-        ranges: ``(B, 1, H, W)`` encoded ranges of a reconstruction.
-        image: ``(B, 1, H, W)`` encoded ranges of the scan. Columns wrap around.
-        returns: bool ``(B, 1, H, W)``, where the scan has a return.
-    """
-    total = torch.zeros(len(image), device=image.device)
-    for columns in (1, 2, 4, 8):
-        true = image.float().roll(-columns, -1) - image
-        error = ranges.float().roll(-columns, -1) - ranges - true
-        pairs = returns & returns.roll(-columns, -1) & (true.abs() < columns * _SAME_SURFACE)
-        total = total + masked_mean(error.abs(), pairs)
-    return total / 4
 
 
 def return_loss(logits: Tensor, returns: Tensor) -> Tensor:

@@ -283,19 +283,14 @@ class GenerativeModule(Stage):
         """
         outputs = self.vae.outputs_of(prediction)
         ranges, returns = image[:, :1], image[:, 1:2] > 0
-        predicted = outputs.ranges
         if self.vae.modes == 2:
-            mixture = self.vae.mixture_of(prediction)
-            predicted, error = mixture.mode(), mixture.nll(ranges)
+            error = self.vae.mixture_of(prediction).nll(ranges)
         else:
-            error = losses.pixel_error(predicted, ranges, self.weights.reconstruction_norm)
+            error = losses.pixel_error(outputs.ranges, ranges, self.weights.reconstruction_norm)
         parts = {
             "reconstruction": losses.masked_mean(error, returns),
             "returns": losses.return_loss(cast(Tensor, outputs.returns), returns),
         }
-        if self.weights.gradient_matching != 0:
-            error = losses.gradient_matching_loss(predicted, ranges, returns)
-            parts["gradient_matching"] = error
         if outputs.intensity is not None:
             error = losses.pixel_error(outputs.intensity, image[:, 2:3])
             parts["intensity"] = losses.masked_mean(error, returns)

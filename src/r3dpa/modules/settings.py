@@ -20,8 +20,6 @@ class LossWeights:
         reconstruction: Weight of the reconstruction error: of all pixels, or, where images have a
             return channel, of those with a return (of two modes, the negative log-likelihood).
         reconstruction_norm: ``l1`` (official code) or ``l2`` (paper); of one mode only.
-        gradient_matching: Weight of the error of range differences along rings, where images have
-            a return channel: in units of the encoded range, so some tens of the others.
         returns: Weight of the cross-entropy of the return channel, where images have one.
         intensity: Weight of the absolute error of the encoded intensity at returns, likewise.
         classes: Weight of the cross-entropy of the class of labelled returns, likewise.
@@ -52,7 +50,6 @@ class LossWeights:
 
     reconstruction: float = 1.0
     reconstruction_norm: Literal["l1", "l2"] = "l1"
-    gradient_matching: float = 0.0
     returns: float = 0.2
     intensity: float = 1.0
     classes: float = 0.2
