@@ -13,7 +13,6 @@ from r3dpa.losses import (
     discriminator_loss,
     flow_matching_loss,
     generator_loss,
-    gradient_matching_loss,
     reconstruction_loss,
 )
 
@@ -29,18 +28,6 @@ def test_reconstruction_loss_is_a_mean_over_all_pixels():
 
 def test_generator_loss_is_minus_the_mean_logit():
     assert generator_loss(torch.tensor([1.0, 3.0])).item() == -2.0
-
-
-def test_gradient_matching_sees_waves_but_no_offset_and_no_edge():
-    image, returns = torch.zeros(2, 1, 4, 64), torch.ones(2, 1, 4, 64, dtype=torch.bool)
-    image[1, ..., 32:] = 0.5  # an edge, which a reconstruction of zeros lacks
-    assert gradient_matching_loss(image + 0.3, image, returns).abs().max() < 1e-6
-    assert gradient_matching_loss(torch.zeros_like(image), image, returns).tolist() == [0, 0]
-    # Waves of four columns: neighbours differ by .01, those of two columns by 0 or .02.
-    waves = torch.tensor([0.0, 0.01, 0.02, 0.01]).repeat(16).expand(2, 1, 4, 64)
-    wavy = gradient_matching_loss(waves, torch.zeros_like(image), returns)
-    torch.testing.assert_close(wavy, torch.full((2,), (0.01 + 0.01 + 0 + 0) / 4))
-    assert gradient_matching_loss(waves, image, returns & (image < -1)).tolist() == [0, 0]
 
 
 def test_a_balanced_gradient_has_a_share_of_the_length_of_that_of_l1():

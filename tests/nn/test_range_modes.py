@@ -9,7 +9,7 @@ import torch
 
 from r3dpa.geometry import LidarSensor, RangeCodec
 from r3dpa.nn import VAE
-from r3dpa.nn.vae import RangeMixture, without_flying_pixels
+from r3dpa.nn.pixel_outputs import RangeMixture, without_flying_pixels, without_ripples
 
 STEM = {"in_channels": 2, "latent_channels": 4, "stem": (4, 8), "channels": 32}
 STEM |= {"channel_multipliers": (1, 2), "strides": ((2, 2),), "num_res_blocks": 1, "modes": 2}
@@ -94,13 +94,34 @@ def test_flying_pixels_move_to_the_nearer_surface(row, result):
     assert torch.equal(found[..., 1::2], image[..., 1::2])
 
 
-def test_decoding_leaves_few_flying_pixels_to_two_modes():
+def test_ripples_are_smoothed_and_edges_stay():
+    generator = torch.Generator().manual_seed(0)
+    surfaces = torch.zeros(1, 1, 3, 64)
+    surfaces[..., 1, 20:23] = -0.4  # a pole
+    surfaces[..., 2, 32:] = 0.4  # a corner
+    ranges = surfaces + 0.005 * torch.randn(surfaces.shape, generator=generator)
+    logit = torch.ones_like(ranges)
+    found = without_ripples(torch.cat([ranges, logit], dim=1))
+    assert torch.equal(found[:, 1:], logit)
+    error = (found[:, :1] - surfaces)[0, 0]
+    assert error.std() < 0.4 * 0.005
+    assert error.abs().max() < 2 * 0.005  # not one pixel of the pole or the corner has moved
+    # What has no return has no part in the mean.
+    logit[..., 1:9] = -1.0
+    ranges[..., 1:9] = 0.02
+    missing = torch.cat([ranges, logit], dim=1)
+    found = without_ripples(missing)
+    assert torch.equal(found[..., 1:9], missing[..., 1:9])
+    assert found[0, 0, 0, 0].abs() < 0.005
+
+
+def test_decoding_leaves_few_flying_pixels_and_ripples_to_two_modes():
     prediction = torch.randn(2, 6, 16, 64, generator=torch.Generator().manual_seed(0))
     chosen = VAE(**STEM).mixture_of(prediction).mode()
     chosen = torch.cat([chosen, prediction[:, -1:]], dim=1)
     image = VAE(**STEM).image_of(prediction)
     assert not torch.equal(image, chosen)
-    torch.testing.assert_close(image, without_flying_pixels(chosen))
+    torch.testing.assert_close(image, without_ripples(without_flying_pixels(chosen)))
     one = prediction[:, :2]
     assert torch.equal(VAE(**STEM | {"modes": 1}).image_of(one), one)
 

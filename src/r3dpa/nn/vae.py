@@ -26,7 +26,12 @@ from r3dpa.nn.layers import (
     downsample,
     zeroed,
 )
-from r3dpa.nn.pixel_outputs import PixelOutputs, RangeMixture, without_flying_pixels
+from r3dpa.nn.pixel_outputs import (
+    PixelOutputs,
+    RangeMixture,
+    without_flying_pixels,
+    without_ripples,
+)
 
 Size = tuple[int, int]
 # AdamW moves a weight by at most its rate a step: without, logits need hundreds of steps to say
@@ -289,12 +294,13 @@ class VAE(Autoencoder):
         """Images ``(B, image_channels, H, W)``, with the likeliest class.
 
         Of two modes, the one of the higher density. A choice for each pixel alone still leaves some
-        that fly, which are moved to a surface; intensity and class stay.
+        that fly, which are moved to a surface, and ripples, which are smoothed; intensity and class
+        stay.
         """
         outputs, image = self.outputs_of(prediction), prediction[:, : self.in_channels]
         if self.modes == 2:
             mode, returns = self.mixture_of(prediction).mode(), cast(Tensor, outputs.returns)
-            image = without_flying_pixels(torch.cat([mode, returns], dim=1))
+            image = without_ripples(without_flying_pixels(torch.cat([mode, returns], dim=1)))
         further = [] if outputs.intensity is None else [outputs.intensity]
         if outputs.classes is not None:
             further.append(outputs.classes.argmax(dim=1, keepdim=True).to(prediction.dtype))
