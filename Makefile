@@ -46,7 +46,7 @@ FIT_FIRST := nice -n 19 $(BIN)/r3dpa fit --config conf/trainer.yaml --config con
 .DEFAULT_GOAL := help
 .PHONY: help install format lint types test test-lowest test-all test-numerics \
 	test-faults test-nodes fuzz notebooks demo my-sensor gallery r3dpa-s \
-	r3dpa-s-control r3dpa-s-rgb r3dpa-s-first r3dpa-s-scores docs clean bench bench-training \
+	r3dpa-s-more r3dpa-s-control r3dpa-s-rgb r3dpa-s-first r3dpa-s-scores docs clean bench bench-training \
 	bench-sampling bench-gpu ablations
 
 help: ## list the targets
@@ -179,6 +179,21 @@ r3dpa-s: $(READY) ## train the second edition of r3dpa-s: 20 hours of a core; st
 		--networks vae ema ema_latent_norm --half --overwrite
 	$(BIN)/r3dpa data objects --data conf/r3dpa_s_2/data.yaml --ckpt $(SECOND)/r3dpa-s.safetensors \
 		--out $(SECOND)/r3dpa-s.objects
+
+r3dpa-s-more: $(READY) ## train the weights of the package on, in five hours of a core: labels, alignment, few steps
+	OMP_NUM_THREADS=1 nice -n 19 $(BIN)/r3dpa data prepare $(SECOND_ALIGNED)
+	$(FIT_SECOND) $(SECOND_DATA) --config conf/r3dpa_s_2/vae_alignment.yaml \
+		--config conf/r3dpa_s_2/decoder_labels.yaml --run_dir $(SECOND)/labels
+	$(FIT_SECOND) $(SECOND_ALIGNED) --config conf/r3dpa_s_2/flow_matching.yaml \
+		--config conf/r3dpa_s_2/aligned.yaml --run_dir $(SECOND)/aligned \
+		--model.init_args.init_from $(SECOND)/labels/checkpoints/last.ckpt
+	$(BIN)/r3dpa convert r3dpa-s $(SECOND)/averaged.safetensors --overwrite \
+		--average_with $(SECOND)/aligned/checkpoints/last.ckpt --decoder $(SECOND)/labels/checkpoints/last.ckpt
+	$(FIT_SECOND) $(SECOND_ALIGNED) --config conf/r3dpa_s_2/flow_matching.yaml \
+		--config conf/r3dpa_s_2/few_step.yaml --model.init_args.vae.init_args.encode_further false \
+		--run_dir $(SECOND)/aligned_few_step --model.init_args.init_from $(SECOND)/averaged.safetensors
+	$(BIN)/r3dpa convert $(SECOND)/aligned_few_step/checkpoints/last.ckpt $(SECOND)/more.safetensors \
+		--networks vae ema ema_latent_norm --half --overwrite
 
 r3dpa-s-control: $(READY) ## its control without alignment, latent noise and joint stage: after make r3dpa-s
 	$(FIT_SECOND) $(SECOND_DATA) --config conf/r3dpa_s_2/vae_alignment.yaml \

@@ -72,6 +72,7 @@ MAKE = (
         "my-sensor DATA=scans",
         "gallery",
         "r3dpa-s",
+        "r3dpa-s-more",
         "r3dpa-s-control",
         "r3dpa-s-rgb",
         "r3dpa-s-first",

@@ -249,7 +249,7 @@ def _with_decoder_of(checkpoint: Checkpoint, other: Checkpoint) -> Checkpoint:
 def _averaged(checkpoint: Checkpoint, other: Checkpoint, share: float) -> Checkpoint:
     """Checkpoint whose flow has ``share`` of the weights of ``other``, in float32.
 
-    Weights that ``other`` lacks, such as those of average velocities, stay.
+    Weights that ``other`` lacks, such as average-velocity blocks, stay.
 
     Source: Wortsman et al., "Robust fine-tuning of zero-shot models" (CVPR 2022).
     """

@@ -34,10 +34,10 @@ def convert(
         encoding: Official files only: range encoding, if the file lacks it.
         networks: Write these alone; sampling needs ``vae ema ema_latent_norm``.
         half: Write weights in float16, half as large.
-        decoder: Checkpoint whose VAE is taken in place of that of ``ckpt``. It must have the same
-            encoder, as after ``train_encoder: false``.
-        average_with: Checkpoint with whose flow that of ``ckpt`` is averaged. Both must have the
-            same encoder, and one should have started from the other.
+        decoder: Checkpoint whose VAE replaces the VAE of ``ckpt``. Both must have the same encoder,
+            as after ``train_encoder: false``.
+        average_with: Checkpoint whose flow is averaged with the flow of ``ckpt``. Both must have
+            the same encoder, and one should have started from the other.
         share: Share of the weights of ``average_with``, from 0 to 1.
     """
     from r3dpa.checkpoints import convert as convert_checkpoint

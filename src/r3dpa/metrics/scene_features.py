@@ -45,7 +45,7 @@ from r3dpa.metrics.networks.rangevit import RangeViT, range_channels
 from r3dpa.metrics.networks.sparse import NUM_BINS, pool_voxels, voxelize
 from r3dpa.metrics.scene import DEFAULT, EvaluationScene, Protocol
 
-# Generated scenes have no intensity: all points get the mean of real scans.
+# Not all generators make intensities: all points get the mean of real scans.
 _INTENSITY = CENTRES[-1]
 
 
