@@ -68,7 +68,7 @@ class Candidates:
 
     def fitted(self, latents, range_m, missing):
         """Latents after some steps of Adam on the error of the decoded known pixels."""
-        codec = self.generator.geometry.codec
+        codec = self.generator.geometry.codec.without_further()
         image = codec.to_image(range_m)
         known = ~missing & codec.informative(image)
         with torch.enable_grad():
@@ -76,7 +76,8 @@ class Candidates:
             adam = torch.optim.Adam([fitted], lr=FIT_RATE)
             for _ in range(FIT_STEPS):
                 raw = self.generator.latent_norm.denormalise(fitted)
-                error = (self.generator.vae.decode(raw)[0] - image).abs() * known
+                decoded = self.generator.vae.decode(raw)[0, : len(image)]
+                error = (decoded - image).abs() * known
                 adam.zero_grad()
                 error.sum().backward()
                 adam.step()
