@@ -33,11 +33,12 @@ endif
 FIT := $(BIN)/r3dpa fit --config conf/trainer.yaml --config conf/r3dpa_s/trainer.yaml $(SOURCE)
 endif
 # The long training of r3dpa-s; the same command continues an interrupted run. The shipped weights are
-# of the first edition, which has other streets and whose SiT was not aligned.
+# of r3dpa-s-first on other streets, trained on by r3dpa-s-more.
 SECOND := runs/r3dpa_s_2
 FIT_SECOND := OMP_NUM_THREADS=1 nice -n 19 $(BIN)/r3dpa fit --config conf/trainer.yaml \
 	--config conf/r3dpa_s_2/trainer.yaml --ckpt_path last
 SCANS ?= 8000
+FROM ?= r3dpa-s
 SECOND_DATA := --config conf/r3dpa_s_2/data.yaml --data.init_args.num_scans $(SCANS)
 SECOND_ALIGNED := $(SECOND_DATA) --config conf/r3dpa_s_2/teacher.yaml
 FIT_FIRST := nice -n 19 $(BIN)/r3dpa fit --config conf/trainer.yaml --config conf/r3dpa_s/trainer.yaml \
@@ -180,14 +181,15 @@ r3dpa-s: $(READY) ## train the second edition of r3dpa-s: 20 hours of a core; st
 	$(BIN)/r3dpa data objects --data conf/r3dpa_s_2/data.yaml --ckpt $(SECOND)/r3dpa-s.safetensors \
 		--out $(SECOND)/r3dpa-s.objects
 
-r3dpa-s-more: $(READY) ## train the weights of the package on, in five hours of a core: labels, alignment, few steps
+r3dpa-s-more: $(READY) ## train weights on, in five hours of a core: labels, alignment, few steps [FROM=r3dpa-s]
 	OMP_NUM_THREADS=1 nice -n 19 $(BIN)/r3dpa data prepare $(SECOND_ALIGNED)
 	$(FIT_SECOND) $(SECOND_DATA) --config conf/r3dpa_s_2/vae_alignment.yaml \
-		--config conf/r3dpa_s_2/decoder_labels.yaml --run_dir $(SECOND)/labels
+		--config conf/r3dpa_s_2/decoder_labels.yaml --run_dir $(SECOND)/labels \
+		--model.init_args.init_from '$(FROM)'
 	$(FIT_SECOND) $(SECOND_ALIGNED) --config conf/r3dpa_s_2/flow_matching.yaml \
 		--config conf/r3dpa_s_2/aligned.yaml --run_dir $(SECOND)/aligned \
 		--model.init_args.init_from $(SECOND)/labels/checkpoints/last.ckpt
-	$(BIN)/r3dpa convert r3dpa-s $(SECOND)/averaged.safetensors --overwrite \
+	$(BIN)/r3dpa convert '$(FROM)' $(SECOND)/averaged.safetensors --overwrite \
 		--average_with $(SECOND)/aligned/checkpoints/last.ckpt --decoder $(SECOND)/labels/checkpoints/last.ckpt
 	$(FIT_SECOND) $(SECOND_ALIGNED) --config conf/r3dpa_s_2/flow_matching.yaml \
 		--config conf/r3dpa_s_2/few_step.yaml --model.init_args.vae.init_args.encode_further false \

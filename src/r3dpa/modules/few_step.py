@@ -104,7 +104,7 @@ class FewStep(FlowMatching):
         self._cached: CachedTensors[_Noise] | None = None
 
     def previous_networks(self, before: Checkpoint) -> Checkpoint:
-        """The averaged flow as the networks of this stage, its last blocks copied once."""
+        """The averaged flow as the networks of this stage, with a copy of its last blocks."""
         if before.interpolant != self.interpolant.path:
             raise ValueError(
                 f"{before.path} was trained on the {before.interpolant} path: set "
@@ -244,6 +244,7 @@ class FewStep(FlowMatching):
 
 
 def _average_weights(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Weights of the copied blocks alone."""
     return {key: value for key, value in weights.items() if key.startswith("average.")}
 
 
