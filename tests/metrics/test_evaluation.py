@@ -336,7 +336,8 @@ def test_one_metric_of_two_sets_is_that_of_an_evaluation():
     for name in ("JSD", "W1 range", "MMD"):
         assert scene_distance(name, scenes(0), scenes(1), PROTOCOL) == rows[name].value
     made = [through_sensor(scene, PROTOCOL)[:2] for scene in scenes(1, 8)]  # names and points
-    assert scene_distance("FGEO coverage", made, made, PROTOCOL) == 1
+    arrays = [(name, points.numpy()) for name, points in made]
+    assert scene_distance("FGEO coverage", made, arrays, PROTOCOL) == 1
     with pytest.raises(
         ValueError, match="unknown metric 'FGEO best'; choose from FGEO, FGEO precision"
     ):

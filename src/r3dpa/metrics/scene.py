@@ -156,7 +156,8 @@ def usable_scenes(
 
 
 def _finite(name: str, what: str, values: Tensor) -> Tensor:
-    values = values.detach().float().cpu()
+    """Values as a float32 tensor on the CPU; arrays of numpy are taken too."""
+    values = torch.as_tensor(values).detach().float().cpu()
     if broken := int((~values.isfinite()).sum()):
         raise ValueError(
             f"{name}: {what} holds {broken} NaN or infinite values; repair the generator, or leave "
