@@ -76,6 +76,7 @@ MAKE = (
         "r3dpa-s-control",
         "r3dpa-s-rgb",
         "r3dpa-s-first",
+        "r3dpa-s-scores",
         "bench-training",
         "bench-sampling",
         "bench-gpu CKPT=a.ckpt",
