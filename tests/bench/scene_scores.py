@@ -3,8 +3,9 @@
     python tests/bench/scene_scores.py --scenes runs/scenes runs/control \
         --data conf/r3dpa_s_2/data.yaml --num 2000 --compared 500 --out scores.json
 
-The measures of notebook 08, whose data have ranges alone, for folders of ``r3dpa sample``. Held-out
-scans are split in two, in turn: the reference, and a set that gives each measure its floor.
+For folders of ``r3dpa sample``; notebook 08 shows the result. Held-out scans are split in two, in
+turn: the reference, and a set that gives each measure its floor. Training scans, of other drives,
+show what a model that knows these alone can reach.
 
 - realism: measures within 3 times the distance between parts of the reference, of those judged;
 - classifier: accuracy of a small network on scenes and reference, 0.5 by chance;
@@ -50,11 +51,16 @@ def statistics_of(images, projection):
     return drives
 
 
+def images_of(data, scans):
+    """Range images ``(N, H, W)`` of scans."""
+    return torch.stack([data.images.read(scan).range_m for scan in scans])
+
+
 def training_images(data):
     """Batches ``(B, H, W)`` of the training scans."""
     scans = data.train_set.scans
     for first in range(0, len(scans), BATCH):
-        yield torch.stack([data.images.read(s).range_m for s in scans[first : first + BATCH]])
+        yield images_of(data, scans[first : first + BATCH])
 
 
 def main(arguments=None):
@@ -68,13 +74,11 @@ def main(arguments=None):
     data = read_data(options.data)
     data.setup("fit")
     scans = evenly(data.val_set.scans, 2 * options.num)
-    reference, held_out = (
-        torch.stack([data.images.read(scan).range_m for scan in scans[first::2]])
-        for first in (0, 1)
-    )
-    sets = {"held-out scans": held_out}
+    reference = images_of(data, scans[::2])
+    sets = {"held-out scans": images_of(data, scans[1::2])}
     for folder in options.scenes:
         sets[folder.name] = torch.from_numpy(np.load(folder / "range_m.npy")[: options.num])
+    sets["training scans"] = images_of(data, evenly(data.train_set.scans, options.num))
     distances = nearest_images(torch.cat(list(sets.values())), training_images(data)).distance
     apart = distances.split([len(images) for images in sets.values()])
     few = torch.stack(evenly(list(reference), options.compared))

@@ -37,6 +37,7 @@ def test_copies_of_training_scans_are_memorised(tmp_path, monkeypatch):
     sets = json.loads(text)["sets"]
     assert sets["copies"]["scenes"] == 4
     assert sets["copies"]["nearest"] == pytest.approx(0, abs=1e-3)
+    assert sets["training scans"]["nearest"] == pytest.approx(0, abs=1e-3)
     assert sets["held-out scans"]["nearest"] > 0.05
     assert 0 <= sets["copies"]["classifier"] <= 1
     assert str(tmp_path) not in text
