@@ -181,7 +181,6 @@ r3dpa-s: $(READY) ## train the second edition of r3dpa-s: 20 hours of a core; st
 	$(BIN)/r3dpa data objects --data conf/r3dpa_s_2/data.yaml --ckpt $(SECOND)/r3dpa-s.safetensors \
 		--out $(SECOND)/r3dpa-s.objects
 
-# The few steps start from those of FROM: of the average, --share 1 takes the aligned flow alone.
 r3dpa-s-more: $(READY) ## train weights on, in five hours of a core: labels, alignment, few steps [FROM=r3dpa-s]
 	OMP_NUM_THREADS=1 nice -n 19 $(BIN)/r3dpa data prepare $(SECOND_ALIGNED)
 	$(FIT_SECOND) $(SECOND_DATA) --config conf/r3dpa_s_2/vae_alignment.yaml \
@@ -190,8 +189,8 @@ r3dpa-s-more: $(READY) ## train weights on, in five hours of a core: labels, ali
 	$(FIT_SECOND) $(SECOND_ALIGNED) --config conf/r3dpa_s_2/flow_matching.yaml \
 		--config conf/r3dpa_s_2/aligned.yaml --run_dir $(SECOND)/aligned \
 		--model.init_args.init_from $(SECOND)/labels/checkpoints/last.ckpt
-	$(BIN)/r3dpa convert '$(FROM)' $(SECOND)/with_few_steps.safetensors --overwrite --share 1.0 \
-		--average_with $(SECOND)/aligned/checkpoints/last.ckpt --decoder $(SECOND)/labels/checkpoints/last.ckpt
+	$(BIN)/r3dpa convert '$(FROM)' $(SECOND)/with_few_steps.safetensors --overwrite \
+		--flow $(SECOND)/aligned/checkpoints/last.ckpt --decoder $(SECOND)/labels/checkpoints/last.ckpt
 	$(FIT_SECOND) $(SECOND_ALIGNED) --config conf/r3dpa_s_2/flow_matching.yaml \
 		--config conf/r3dpa_s_2/few_step.yaml --model.init_args.vae.init_args.encode_further false \
 		--run_dir $(SECOND)/aligned_few_step --model.init_args.init_from $(SECOND)/with_few_steps.safetensors
@@ -243,7 +242,7 @@ SCENES ?= 2000
 SCORES := runs/r3dpa_s_scores
 KEPT := notebooks/results/r3dpa_s
 MEASURE := OMP_NUM_THREADS=1 nice -n 19 $(BIN)
-r3dpa-s-scores: $(READY) ## measure the weights of the package: two hours of a core [SCENES=2000]
+r3dpa-s-scores: $(READY) ## measure the weights of the package: hours of a core [SCENES=2000]
 	$(MEASURE)/r3dpa data prepare --config conf/r3dpa_s_2/data.yaml
 	$(MEASURE)/r3dpa sample --num $(SCENES) --batch_size 8 --formats '[]' --out $(SCORES)/r3dpa-s
 	test -e $(SCORES)/reference.safetensors || $(MEASURE)/r3dpa data reference \

@@ -126,34 +126,36 @@ def test_a_decoder_that_was_trained_on_takes_the_place_of_the_first(tmp_path):
         convert(first, out, decoder=changed("quant_conv.", "encoder.safetensors"), overwrite=True)
 
 
-def test_a_flow_is_averaged_with_one_that_was_trained_on(tmp_path):
+@pytest.mark.parametrize("stage", ["flow_matching", "few_step"])
+def test_a_flow_that_was_trained_on_takes_the_place_of_the_first(tmp_path, stage):
     few = tiny_checkpoint(tmp_path / "few.safetensors", stage="few_step")
-    flow, out = tiny_checkpoint(tmp_path / "flow.safetensors"), tmp_path / "out.safetensors"
-    content = read_checkpoint(flow)
+    out = tmp_path / "out.safetensors"
+    content = read_checkpoint(tiny_checkpoint(tmp_path / "first.safetensors", stage=stage))
 
-    def trained_on(network):
-        state = content.network(network)
-        weights = {key: value + 1 for key, value in state.state_dict.items()}
-        networks = {**content.networks, network: replace(state, state_dict=weights)}
-        path = tmp_path / f"{network}.safetensors"
+    def trained_on(*names):
+        networks = dict(content.networks)
+        for name in names:
+            state = networks[name]
+            weights = {key: value + 1 for key, value in state.state_dict.items()}
+            networks[name] = replace(state, state_dict=weights)
+        path = tmp_path / f"{names[0]}.safetensors"
         return save_checkpoint(replace(content, networks=networks), path)
 
-    moved = trained_on("ema")
-    convert(few, out, average_with=moved, share=0.25)
+    moved = trained_on("ema", "ema_latent_norm")
+    convert(few, out, flow=moved)
     before, after, others = load_file(few), load_file(out), load_file(moved)
     assert read_checkpoint(out).networks["ema"].class_path.endswith("AverageVelocitySiT")
-    for key, value in before.items():
-        averaged = key.startswith("ema.") and not key.startswith("ema.average.")
-        expected = 0.75 * value + 0.25 * others[key] if averaged else value
-        torch.testing.assert_close(after[key], expected, msg=key)
+    taken = {key for key in before if not torch.equal(before[key], after[key])}
+    assert {key.split(".")[0] for key in taken} == {"ema", "ema_latent_norm"}
+    assert not any(key.startswith("ema.average.") for key in taken)  # few steps stay
+    assert all(torch.equal(after[key], others[key]) for key in taken)
     wide = tiny_checkpoint(tmp_path / "wide.safetensors", sit_args={"mlp_ratio": 2.0})
-    for other, share, message in (
-        (moved, 1.5, r"share must lie in \[0, 1\], got 1\.5"),
-        (wide, 0.5, r"ema\.blocks\.0\.mlp\.fc1\.bias has shape"),
-        (trained_on("vae"), 0.5, "has another encoder than"),
+    for other, message in (
+        (wide, r"blocks\.0\.mlp\.fc1\.bias has shape"),
+        (trained_on("vae"), "has another encoder than"),
     ):
         with pytest.raises(ValueError, match=message):
-            convert(few, out, average_with=other, share=share, overwrite=True)
+            convert(few, out, flow=other, overwrite=True)
 
 
 def test_half_precision_rounds_all_but_statistics(shipped, tmp_path):

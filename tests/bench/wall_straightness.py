@@ -59,7 +59,7 @@ def main(arguments=None):
     options = parser.parse_args(arguments)
     vae = SceneVAE.from_checkpoint(options.ckpt, "cpu")
     projection = vae.geometry.projection
-    scenes = torch.from_numpy(np.load(options.scenes / "range_m.npy", mmap_mode="r")[: options.num])
+    scenes = torch.from_numpy(np.load(options.scenes / "range_m.npy")[: options.num])
     pixels = list(held_out_pixels(read_data(options.data), options.num))
     pairs = [reconstruct(vae, [each]) for each in pixels]
     results = {

@@ -54,6 +54,8 @@ _LIGHTNING = {
 # A class that Lightning 1.4 writes as a key, in the checkpoints of LiDM; read as ``object``.
 _OLD_CALLBACK = "pytorch_lightning.callbacks.model_checkpoint.ModelCheckpoint"
 _ENCODER = ("encoder.", "quant_conv.")
+_FLOW = frozenset({"sit", "latent_norm", "ema", "ema_latent_norm"})
+_FEW_STEPS = "average."  # copied blocks of an AverageVelocitySiT
 _LOST = ("sensor and encoding", "step", "arguments of the latent statistics")
 _DIFFUSERS_KEY = "encoder.down_blocks.0.resnets.0.norm1.weight"
 # Names of attention layers before diffusers 0.14, as in the files of Stable Diffusion itself.
@@ -152,8 +154,7 @@ def convert(
     networks: Sequence[str] | None = None,
     half: bool = False,
     decoder: str | Path | None = None,
-    average_with: str | Path | None = None,
-    share: float = 0.5,
+    flow: str | Path | None = None,
 ) -> str:
     """Convert a checkpoint of any layout to ours, or to the official one.
 
@@ -167,12 +168,12 @@ def convert(
 
     Raises:
         ValueError: If a network has no counterpart in the other layout, a file exists, the VAE of
-            ``decoder`` or ``average_with`` has other latents, or ``share`` is not in [0, 1].
+            ``decoder`` or ``flow`` has other latents, or the flow another shape.
     """
     source, out = Path(source), Path(out)
     checkpoint = read_checkpoint(source, sit_args=sit_args, encoding=encoding)
-    if average_with is not None:
-        checkpoint = _averaged(checkpoint, read_checkpoint(average_with), share)
+    if flow is not None:
+        checkpoint = _with_flow_of(checkpoint, read_checkpoint(flow))
     if decoder is not None:
         checkpoint = _with_decoder_of(checkpoint, read_checkpoint(decoder))
     if networks is not None or half:
@@ -246,29 +247,22 @@ def _with_decoder_of(checkpoint: Checkpoint, other: Checkpoint) -> Checkpoint:
     return replace(checkpoint, networks=networks, geometry=geometry)
 
 
-def _averaged(checkpoint: Checkpoint, other: Checkpoint, share: float) -> Checkpoint:
-    """Checkpoint whose flow has ``share`` of the weights of ``other``, in float32.
-
-    Weights that ``other`` lacks, such as average-velocity blocks, stay.
-
-    Source: Wortsman et al., "Robust fine-tuning of zero-shot models" (CVPR 2022).
-    """
-    if not 0 <= share <= 1:
-        raise ValueError(f"share must lie in [0, 1], got {share}")
+def _with_flow_of(checkpoint: Checkpoint, other: Checkpoint) -> Checkpoint:
+    """Checkpoint with the flow of ``other`` and its latent statistics; its few steps stay."""
     _check_same_latents(checkpoint, other)
     networks = dict(checkpoint.networks)
-    for name in {"sit", "ema"} & networks.keys() & other.networks.keys():
-        weights, others = networks[name].state_dict, other.networks[name].state_dict
-        shared = weights.keys() & others.keys()
-        for key in sorted(shared):
-            here, there = tuple(weights[key].shape), tuple(others[key].shape)
+    for name in _FLOW & networks.keys():
+        weights, given = networks[name].state_dict, other.network(name).state_dict
+        flow = {key: value for key, value in given.items() if not key.startswith(_FEW_STEPS)}
+        needed = {key for key in weights if not key.startswith(_FEW_STEPS)}
+        for key in sorted(needed | flow.keys()):
+            here, there = (tuple(of[key].shape) if key in of else None for of in (weights, flow))
             if here != there:
                 raise ValueError(
-                    f"{other.path} cannot be averaged with {checkpoint.path}: {name}.{key} has "
+                    f"the flow of {other.path} does not fit {checkpoint.path}: {name}.{key} has "
                     f"shape {there} there and {here} here"
                 )
-        averaged = {k: weights[k].float().lerp(others[k].float(), share) for k in shared}
-        networks[name] = replace(networks[name], state_dict={**weights, **averaged})
+        networks[name] = replace(networks[name], state_dict={**weights, **flow})
     return replace(checkpoint, networks=networks)
 
 

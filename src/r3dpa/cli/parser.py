@@ -237,7 +237,7 @@ def run_function(function: Callable[..., Any], words: Sequence[str], prog: str) 
 
 def _check_inputs(parser: Parser, arguments: Mapping[str, Any]) -> None:
     """Refuse files that do not exist, before torch is imported, which takes seconds."""
-    for name in ("ckpt", "decoder", "average_with"):
+    for name in ("ckpt", "decoder", "flow"):
         ckpt = arguments.get(name)
         if isinstance(ckpt, Path) and not str(ckpt).startswith("hf:/"):
             weights_file(ckpt)

@@ -18,8 +18,7 @@ def convert(
     networks: list[str] | None = None,
     half: bool = False,
     decoder: Path | None = None,
-    average_with: Path | None = None,
-    share: float = 0.5,
+    flow: Path | None = None,
 ) -> str:
     """Convert official checkpoints into ours, or ours into official ones.
 
@@ -36,9 +35,8 @@ def convert(
         half: Write weights in float16, half as large.
         decoder: Checkpoint whose VAE replaces the VAE of ``ckpt``. Both must have the same encoder,
             as after ``train_encoder: false``.
-        average_with: Checkpoint whose flow is averaged with the flow of ``ckpt``. Both must have
-            the same encoder, and one should have started from the other.
-        share: Share of the weights of ``average_with``, from 0 to 1.
+        flow: Checkpoint whose flow, with its latent statistics, replaces the flow of ``ckpt``; the
+            few steps of ``ckpt`` stay. Both must have the same encoder.
     """
     from r3dpa.checkpoints import convert as convert_checkpoint
 
@@ -52,8 +50,7 @@ def convert(
         networks=networks,
         half=half,
         decoder=decoder,
-        average_with=average_with,
-        share=share,
+        flow=flow,
     )
 
 

@@ -189,7 +189,8 @@ def scene_distance(
         name: As in the tables: ``JSD``, ``TV``, ``MMD``, ``CD 3D``, ``W1 range``; ``JSD points``,
             ``MMD kernel`` and ``MMD 0.5 m`` of the baselines; a feature space, such as ``FWID``,
             for its Fréchet distance, or ``FWID KID``, ``FWID precision``, ...
-        real: Scenes as ``(name, points)``, or what :func:`r3dpa.data.samples.read_samples` gives.
+        real: Scenes as ``(name, points)``, points ``(P, 3)`` a tensor or array of metres, or what
+            :func:`r3dpa.data.samples.read_samples` gives.
         generated: The same.
         protocol: Preparation of the scenes.
         ckpt: Official weights of the feature space.
