@@ -7,6 +7,7 @@ import json
 import logging
 import os
 import subprocess
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -189,6 +190,19 @@ class ScaledPoints(nn.Module):
 
     def forward(self, points):
         return self.point_features([self.prepare(points)])[0]
+
+
+@pytest.fixture
+def until_logged(caplog):
+    """``until_logged(words)``: waits half a minute at most for a thread to log these words."""
+
+    def wait(words: str) -> None:
+        end = time.monotonic() + 30
+        while words not in caplog.text:
+            assert time.monotonic() < end, f"{words!r} was not logged"
+            time.sleep(0.001)
+
+    return wait
 
 
 @pytest.fixture

@@ -1,6 +1,5 @@
 import os
 import re
-import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from threading import Event
@@ -204,7 +203,7 @@ def test_an_error_keeps_what_was_made(tmp_path, made, projection, scaled_points,
 
 
 def test_two_jobs_at_once_make_each_grid_once(
-    tmp_path, made, projection, scaled_points, files_of, caplog
+    tmp_path, made, projection, scaled_points, files_of, until_logged
 ):
     (scans, complete), root = made, tmp_path / "again"
     started = Event()
@@ -212,7 +211,7 @@ def test_two_jobs_at_once_make_each_grid_once(
     class Slow(scaled_points):
         def point_features(self, prepared):
             started.set()
-            time.sleep(0.05)
+            until_logged("waiting for another process that makes feature grids in")
             return super().point_features(prepared)
 
     def write(extractor):
@@ -224,7 +223,6 @@ def test_two_jobs_at_once_make_each_grid_once(
         second = pool.submit(write, scaled_points())
         assert (first.result(), second.result()) == (5, 0)
     assert files_of(root) == files_of(complete)
-    assert "waiting for another process that makes feature grids in" in caplog.text
 
 
 def test_a_folder_that_cannot_be_written_is_named(tmp_path, made, projection, scaled_points):

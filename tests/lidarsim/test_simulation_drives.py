@@ -277,14 +277,14 @@ class TestInterrupted:
         killer.join()
         assert 0 < len(stems(tmp_path)) < 200
 
-    def test_a_second_call_waits_for_the_first(self, tmp_path, caplog):
+    def test_a_second_call_waits_for_the_first(self, tmp_path, until_logged):
         simulate(tmp_path, 3, **SMALL)
         second = threading.Thread(target=simulate, args=(tmp_path, 3), kwargs=SMALL)
         with only_writer(tmp_path / ".lock", "simulates"):
             second.start()
-            second.join(0.3)
+            until_logged("waiting for another process")
+            second.join(0.1)
             assert second.is_alive()
-            assert "waiting for another process" in caplog.text
         second.join(10)
         assert not second.is_alive()
 
