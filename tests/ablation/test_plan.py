@@ -10,6 +10,7 @@ from resolved_fits import resolved
 from r3dpa.ablation import budget_of, make_plan
 from r3dpa.ablation.runs import plan_jobs
 from r3dpa.cli.bench import resolve_config
+from r3dpa.cli.features import features_parser, with_data_class
 
 TABLES = Path(__file__).resolve().parents[2] / "conf" / "ablation"
 SEEDS = ("seed_everything", "model.init_args.seed", "data.init_args.seed", "scorer.seed")
@@ -151,3 +152,5 @@ def test_tables_of_r3dpa_s_share_trainings_and_prepare_cached_images(tmp_path, m
     assert kinds == {"vae_alignment": 6, "flow_matching": 12, "joint": 3}
     jobs = plan_jobs(plans[0])
     assert jobs[0].words == ["data", "prepare", "--config", str(tmp_path / "data.yaml")]
+    parser = features_parser("test")  # the options of the scans fit each other
+    parser.instantiate(parser.parse_args(with_data_class(["--data", f"{tmp_path}/data.yaml"])))
