@@ -146,7 +146,8 @@ class Scene:
 class SceneBatch:
     """Generated scenes, on the device of the networks.
 
-    ``batch[i]`` and iteration give a :class:`Scene`, ``batch[1:3]`` a batch of some.
+    ``batch[i]`` and iteration give a :class:`Scene`, ``batch[1:3]`` and ``batch[order]``, a tensor
+    of numbers, a batch of some.
 
     Attributes:
         range_m: ``(B, H, W)`` float32 metres; -1 without a return, NaN for a whole scene if the
@@ -199,11 +200,11 @@ class SceneBatch:
     def __getitem__(self, index: int) -> Scene: ...
 
     @overload
-    def __getitem__(self, index: slice) -> Self: ...
+    def __getitem__(self, index: slice | Tensor) -> Self: ...
 
-    def __getitem__(self, index: int | slice) -> Scene | Self:
+    def __getitem__(self, index: int | slice | Tensor) -> Scene | Self:
         """One scene, or a batch of some."""
-        if isinstance(index, slice):
+        if isinstance(index, slice | Tensor):
             values = {field.name: getattr(self, field.name) for field in fields(self)}
             parts: dict[str, Any] = {
                 name: value[index] for name, value in values.items() if isinstance(value, Tensor)

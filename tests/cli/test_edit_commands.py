@@ -98,6 +98,8 @@ class TestFiles:
         assert about["feature_source"] == "geometric"
         assert about["nfe"] == 8  # two midpoint steps there, two back
         assert len(about["cosine"]) == 2
+        assert sorted(about["draws"]) == [0, 1]
+        assert about["likeness"] == sorted(about["likeness"], reverse=True)
         page = (tmp_path / "o" / "edit.html").read_text()
         assert "before: scan a" in page
         assert "inpaint 1" in page

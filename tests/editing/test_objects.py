@@ -9,6 +9,7 @@ from safetensors.torch import save_file
 from lidarsim import Semantic
 from r3dpa.data import Scan, ScanError, write_bin
 from r3dpa.data.labels import CLASS_NAMES, read_labels
+from r3dpa.editing import EditResult, most_like_first
 from r3dpa.editing.objects import ObjectClass, ObjectLibrary, object_library
 from r3dpa.geometry import LidarSensor, Pixels, RingProjection, SphericalProjection
 
@@ -165,6 +166,34 @@ def test_features_may_be_targets_of_a_backward_pass(library):
     weight = torch.ones(4, requires_grad=True)
     (library.feature("car") * weight).sum().backward()
     assert weight.grad.equal(library.feature("car"))
+
+
+class Distances(torch.nn.Module):
+    """Feature of a point: its distance, and 10 m."""
+
+    def prepare(self, points):
+        return points
+
+    def point_features(self, prepared):
+        distances = [points[:, :3].norm(dim=1) for points in prepared]
+        return [torch.stack([each, torch.full_like(each, 10.0)], dim=1) for each in distances]
+
+
+def test_the_draw_most_like_the_object_comes_first():
+    projection = SphericalProjection(LidarSensor(beams=4, columns=8))
+    range_m = torch.full((4, 4, 8), 30.0)
+    mask = torch.zeros(4, 8, dtype=torch.bool)
+    mask[2:, 4:6] = True
+    for draw, metres in enumerate([5.0, 12.0, 9.0, -1.0]):  # the last one has no return there
+        range_m[draw, mask] = metres
+    edits = EditResult(range_m, torch.arange(4.0), 2, projection, cosine=torch.arange(4.0))
+    ordered = most_like_first(edits, mask, torch.tensor([1.0, 1.0]), Distances(), (2, 4))
+    assert ordered.draws.tolist() == [2, 1, 0, 3]
+    assert ordered.range_m.equal(range_m[[2, 1, 0, 3]])
+    assert ordered.cosine.tolist() == ordered.latents.tolist() == [2, 1, 0, 3]
+    cosine = torch.nn.functional.cosine_similarity(torch.tensor([9.0, 10.0]), torch.ones(2), dim=0)
+    assert ordered.likeness[0] == pytest.approx(cosine.item())
+    assert ordered.likeness[3] == 0
 
 
 def test_library_comes_back_from_its_file(tmp_path, library):

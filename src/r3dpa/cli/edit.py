@@ -24,6 +24,7 @@ def inpaint(
     window: tuple[float, float] | None = None,
     start: float = 1.0,
     dilation: int = 0,
+    features_ckpt: Path | None = None,
     num: PositiveInt = 8,
     **options: Any,
 ) -> str:
@@ -31,8 +32,9 @@ def inpaint(
 
     The part is one of --box, --box3d and --mask; pixels outside it keep the scan's values. The
     object is a class of the mean features beside the weights, such as car, pedestrian, tree or
-    pole, or of a file (--objects FILE --object car); without one the edit is unguided. Azimuth 0
-    looks forward and grows to the left; 180 is behind.
+    pole, or of a file (--objects FILE --object car); without one the edit is unguided. Not every
+    draw becomes the object: the feature source looks at all of them, and the one that is most like
+    it comes first. Azimuth 0 looks forward and grows to the left; 180 is behind.
 
     Args:
         scan: Scan to edit: ``.bin``, ``.ply``, or ``.npz`` of one scan.
@@ -46,6 +48,8 @@ def inpaint(
         window: First and last guided time; 0 data, 1 noise; default: all.
         start: First time of the edit; below 1 keeps some of the original part.
         dilation: Rings of tokens around the part to generate as well; pixels outside are restored.
+        features_ckpt: Weights of the feature source, if it has none of its own; without them, the
+            results stay in the order of the draws.
         num: Number of results, one per seed index.
         **options: See :class:`EditOptions`.
     """
@@ -60,6 +64,7 @@ def inpaint(
         "window": window,
         "start": start,
         "dilation": dilation,
+        "features_ckpt": features_ckpt,
     }
     if sum(region is not None for region in (box, box3d, mask)) != 1:
         raise ValueError("give one of --box, --box3d and --mask: the part that is to change")
@@ -73,7 +78,7 @@ def inpaint(
         arguments["objects"] = objects = objects or objects_file(ckpt)
     from r3dpa.cli.edit_session import EditSession
     from r3dpa.cli.scene_files import feature_source_of
-    from r3dpa.editing import regions
+    from r3dpa.editing import EditResult, most_like_first, regions
     from r3dpa.editing.objects import ObjectLibrary
 
     session = EditSession(EditOptions(**options), num, strength, window)
@@ -84,13 +89,28 @@ def inpaint(
         region = regions.angle_box(session.projection, *box)
     elif box3d is not None:
         region = regions.box3d(session.projection, box3d[:3], box3d[3:6], box3d[6])
-    feature = None
+    feature = extractor = None
     if object is not None and objects is not None:
         library = ObjectLibrary.load(objects)
         library.check_source(feature_source_of(session.checkpoint), session.sit.feature_dim)
         feature = library.feature(object)
-    run = partial(session.editor.inpaint, source.pixels, region, num, session.options.seed)
-    run = partial(run, feature=feature, start=start, dilation=dilation)
+        if features_ckpt is not None or library.source != "scalr":
+            extractor = session.extractor(features_ckpt)
+
+    def run() -> EditResult:
+        edits = session.editor.inpaint(
+            source.pixels,
+            region,
+            num,
+            session.options.seed,
+            feature=feature,
+            start=start,
+            dilation=dilation,
+        )
+        if feature is None or extractor is None:
+            return edits
+        return most_like_first(edits, region, feature, extractor, session.sit.grid_size)
+
     scans, names = {f"scan {scan.stem}": source}, ("kept", object or "generated anew")
     return session.write("inpaint", arguments, scans, run, region, names, feature is not None)
 

@@ -158,10 +158,14 @@ class EditSession:
         """Mask ``(H, W)`` of a picture; refused if it selects nothing or all."""
         return check_mask(read_mask(path, self.sensor), str(path))
 
+    def extractor(self, ckpt: Path | None) -> Any:
+        """The feature source of the checkpoint, on the device of the networks."""
+        source = feature_source_of(self.checkpoint)
+        return feature_source(source, ckpt, self.sit.feature_dim).to(self.device)
+
     def feature_grids(self, scans: Iterable[ScanView], ckpt: Path | None) -> list[Tensor]:
         """Feature grid ``(N, F)`` of each scan, as ``r3dpa data features`` writes them."""
-        source = feature_source_of(self.checkpoint)
-        extractor: Any = feature_source(source, ckpt, self.sit.feature_dim).to(self.device)
+        extractor = self.extractor(ckpt)
         grids = []
         for path, points, _ in scans:
             file = Scan(path.parent.name, path.stem, path)
@@ -201,7 +205,9 @@ class EditSession:
             self.show(command, scans, result.range_m, parts, part_names)
             measured = ("nfe", "vae_error_m", "round_trip_m")
             request |= {name: getattr(result, name) for name in measured} | {"seconds": seconds}
-            request["cosine"] = None if result.cosine is None else result.cosine.tolist()
+            for name in ("cosine", "draws", "likeness"):
+                values = getattr(result, name)
+                request[name] = None if values is None else values.tolist()
             writer.finish(request)
         return (
             f"{command}: {self.num} scene{'s' * (self.num != 1)} in {options.out}, {result.nfe} "

@@ -87,11 +87,16 @@ class EditResult(SceneBatch):
             inversion.
         cosine: ``(B,)`` mean cosine between projected features of the latents and the features
             that guided them; None without features.
+        draws: ``(B,)`` int64 number of each result among the draws, where they were ordered by
+            :func:`r3dpa.editing.most_like_first`; else None.
+        likeness: ``(B,)`` that they were ordered by, in [-1, 1]; else None.
     """
 
     vae_error_m: float | None = None
     round_trip_m: float | None = None
     cosine: Tensor | None = None
+    draws: Tensor | None = None
+    likeness: Tensor | None = None
 
 
 class SceneEditor:

@@ -1,4 +1,4 @@
-"""The mean feature of each labelled class of scans.
+"""The mean feature of each labelled class of scans, and which edits come near it.
 
 Letters: K values before the linear step, N = h * w cells, D feature width, C classes.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -21,11 +21,15 @@ from r3dpa.data.datasets import CachedImages, points_at_pixels
 from r3dpa.data.feature_grids import Extractor
 from r3dpa.data.labels import CLASS_NAMES, read_labels
 from r3dpa.data.scans import Scan
+from r3dpa.editing.editor import EditResult
+from r3dpa.editing.regions import token_mask
 from r3dpa.geometry import (
     LidarSensor,
+    Pixels,
     Projection,
     in_range,
     labels_of,
+    pool_cells,
     projection_to_dict,
     values_at_returns,
 )
@@ -225,6 +229,44 @@ def object_library(
         projection_to_dict(projection),
         (grid_size[0], grid_size[1]),
     )
+
+
+@torch.no_grad()
+def most_like_first(
+    edits: EditResult,
+    pixel_mask: Tensor,
+    feature: Tensor,
+    extractor: Extractor,
+    grid_size: tuple[int, int],
+) -> EditResult:
+    """Order the draws of an inpainted part by their likeness to an object, the greatest first.
+
+    Likeness is the mean cosine between the feature of the object and the features of the part's
+    cells, which the feature source takes from the points of the draw. The ``cosine`` of the edits
+    cannot replace it: it is of features that the network predicts, which guidance may raise
+    without making an object.
+
+    Args:
+        edits: Draws of :meth:`SceneEditor.inpaint`.
+        pixel_mask: ``(H, W)`` bool of the part.
+        feature: ``(D,)`` of the object, see :meth:`ObjectLibrary.feature`.
+        extractor: Feature source of the object.
+        grid_size: Rows and columns (h, w) of the cells.
+
+    Returns:
+        The edits in that order, with their ``draws`` and ``likeness``.
+    """
+    tokens, projection = token_mask(pixel_mask, grid_size), edits.projection
+    lift = getattr(extractor, "lift", torch.nn.Identity())
+    likeness = []
+    for scene in edits:
+        points = points_at_pixels(Pixels(scene.range_m, scene.intensity), projection)
+        values = extractor.point_features([extractor.prepare(points)])[0]
+        means, _ = pool_cells(points[:, :3].to(values.device), values, projection, grid_size)
+        cells = lift(means).float().cpu()[tokens]
+        likeness.append(F.cosine_similarity(cells, feature, dim=1).mean())
+    measured = replace(edits, draws=torch.arange(len(edits)), likeness=torch.stack(likeness))
+    return measured[torch.stack(likeness).argsort(descending=True, stable=True)]
 
 
 def _labelled_points(
