@@ -10,6 +10,8 @@ from typing import Literal, get_args
 
 SOURCES = ("scalr", "waffleiron-s", "waffleiron-s-2", "geometric")
 """Extractors of point features that the method aligns with."""
+OWN_WEIGHTS = SOURCES[1:]
+"""Sources that need no file: their weights come with the package, or they have none."""
 
 FeatureSpace = Literal[
     "frid",

@@ -9,6 +9,7 @@ from typing import Any
 from jsonargparse.typing import PositiveInt
 
 from r3dpa.cli.parser import EditOptions
+from r3dpa.feature_names import OWN_WEIGHTS
 from r3dpa.pretrained import check_features, objects_file
 
 
@@ -94,7 +95,7 @@ def inpaint(
         library = ObjectLibrary.load(objects)
         library.check_source(feature_source_of(session.checkpoint), session.sit.feature_dim)
         feature = library.feature(object)
-        if features_ckpt is not None or library.source != "scalr":
+        if features_ckpt is not None or library.source in OWN_WEIGHTS:
             extractor = session.extractor(features_ckpt)
 
     def run() -> EditResult:

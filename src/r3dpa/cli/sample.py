@@ -8,6 +8,7 @@ from typing import Any, Literal
 from jsonargparse.typing import NonNegativeInt, PositiveInt
 
 from r3dpa.cli.parser import ODESolver, SceneOptions, check_file
+from r3dpa.feature_names import OWN_WEIGHTS
 from r3dpa.pretrained import DEFAULT_WEIGHTS, OBJECTS_SUFFIX, weights_file
 
 
@@ -164,8 +165,8 @@ def gallery(
     """Write one page of scenes in order, none left out, with clouds to turn.
 
     The nearest training scan beside each scene shows what is memorised. Edits of the first scene
-    follow, with a car put into it where the weights have features of cars, and fog, rain and snow
-    in it.
+    follow, and fog, rain and snow in it. Where the weights have features of cars, a car is put into
+    it: the two of eight draws that are most like one.
 
     Args:
         out: HTML file to write.
@@ -182,8 +183,9 @@ def gallery(
 
     from r3dpa.checkpoints import read_checkpoint
     from r3dpa.cli.features import read_data
-    from r3dpa.editing import SceneEditor, regions
+    from r3dpa.editing import SceneEditor, most_like_first, regions
     from r3dpa.editing.objects import ObjectLibrary
+    from r3dpa.features import feature_source
     from r3dpa.generation import SceneGenerator
     from r3dpa.io import usable_device, write_text
     from r3dpa.scenes import Scene
@@ -192,11 +194,15 @@ def gallery(
     check_file(out)
     checkpoint = read_checkpoint(ckpt)
     generator = SceneGenerator.from_checkpoint(checkpoint, quality, device=usable_device(device))
-    car, objects = None, weights_file(ckpt).with_suffix(OBJECTS_SUFFIX)
+    car: Tensor | None = None
+    teacher: Any = None
+    objects = weights_file(ckpt).with_suffix(OBJECTS_SUFFIX)
     if objects.is_file():
         library = ObjectLibrary.load(objects)
         library.check_source(checkpoint.feature_source, generator.sit.feature_dim)
         car = library.feature("car") if "car" in library.names else None
+        if library.source in OWN_WEIGHTS:
+            teacher = feature_source(library.source, dim=generator.sit.feature_dim)
     module = None if data is None else read_data(data)
     if module is not None:
         module.setup("fit")
@@ -217,8 +223,10 @@ def gallery(
         }
         if car is not None:
             place = regions.box3d(projection, (10.0, 0.0, -0.95), (4.2, 1.8, 1.5))
-            with_car = editor.inpaint(scene, place, 2, seed, feature=car)
-            results["a car 10 m ahead"] = with_car.range_m
+            draws = editor.inpaint(scene, place, 8, seed, feature=car)
+            if teacher is not None:
+                draws = most_like_first(draws, place, car, teacher, generator.sit.grid_size)
+            results["a car 10 m ahead"] = draws.range_m[:2]
         return results
 
     page = gallery_page(generator, str(ckpt), num, edit, module, seed, batch_size)

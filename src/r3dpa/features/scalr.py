@@ -17,7 +17,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from r3dpa.feature_names import SOURCES
+from r3dpa.feature_names import OWN_WEIGHTS, SOURCES
 from r3dpa.features.geometric import GeometricFeatures, random_basis
 from r3dpa.features.official import (
     FrozenNetwork,
@@ -306,7 +306,7 @@ def feature_source(name: str, ckpt: str | Path | None = None, dim: int = 768) ->
         if ckpt is None:
             raise ValueError(
                 "feature source scalr needs ckpt, the released ckpt_last.pth; without it, choose "
-                f"from {', '.join(SOURCES[1:])}"
+                f"from {', '.join(OWN_WEIGHTS)}"
             )
         scalr = ScaLR.from_checkpoint(ckpt)
         if scalr.dim != dim:
