@@ -66,6 +66,50 @@ MISTAKES = {
 }
 
 
+def logger(kind, **init_args):
+    return {"class_path": f"lightning.pytorch.loggers.{kind}", "init_args": init_args}
+
+
+WANDB = logger("WandbLogger", save_dir="", offline=True)
+CSV = logger("CSVLogger", save_dir="", name="")
+
+
+# Comes first: wandb's own process writes its file while the other tests run.
+@pytest.fixture(scope="module")
+def fitted(smoke_args, make_once):
+    """Run folder of a short fit of vae_alignment as a user starts it, and both its outputs."""
+
+    def fit(folder):
+        words = smoke_args("vae_alignment", folder / "run", "--trainer.enable_progress_bar=true")
+        words += [f"--trainer.logger={json.dumps([WANDB, CSV])}", "--trainer.callbacks=[]"]
+        folder.mkdir()
+        with (folder / "stdout").open("w") as out, (folder / "stderr").open("w") as errors:
+            command = [sys.executable, "-m", "r3dpa", *words]
+            subprocess.run(command, stdout=out, stderr=errors, timeout=400, check=True)
+
+    folder = make_once("fitted", fit)
+    stdout, stderr = ((folder / name).read_text() for name in ("stdout", "stderr"))
+    return folder / "run", stdout, stderr
+
+
+def test_a_fit_says_what_it_lacks_and_what_follows(fitted):
+    run_dir, _, stderr = fitted
+    ckpt = run_dir / "checkpoints" / "last.ckpt"
+    assert "without --model.init_args.rgb_weights the frozen SiT is random" in stderr
+    assert "global batch: 2 = 2 per process x 1 processes x 1 accumulated" in stderr
+    next_command = f"next: r3dpa fit joint --model.init_args.init_from {ckpt}"
+    assert stderr.splitlines()[-1] == f"checkpoint: {ckpt}; {next_command}"
+
+
+def test_the_bar_of_a_fit_shows_losses_and_no_notices_remain(fitted):
+    _, stdout, stderr = fitted
+    assert "loss=" in stdout
+    assert "reconstruction=" in stdout
+    assert "v_num" not in stdout
+    notices = ("GPU available", "TPU", "Tip", "anonymous", "Seed set", "wandb sync", "sync_dist")
+    assert not [notice for notice in notices if notice in stdout + stderr]
+
+
 @pytest.fixture(scope="module")
 def answers(tmp_path_factory):
     """Answers to the mistakes in one process, and slow packages imported up to each of them."""
@@ -250,49 +294,6 @@ def test_completion(typed, completed, capsys):
 def test_short_names_of_commands_are_unique():
     assert set(ALIASES.values()) <= set(COMMANDS)
     assert not set(ALIASES) & set(COMMANDS)
-
-
-def logger(kind, **init_args):
-    return {"class_path": f"lightning.pytorch.loggers.{kind}", "init_args": init_args}
-
-
-WANDB = logger("WandbLogger", save_dir="", offline=True)
-CSV = logger("CSVLogger", save_dir="", name="")
-
-
-@pytest.fixture(scope="module")
-def fitted(smoke_args, make_once):
-    """Run folder of a short fit of vae_alignment as a user starts it, and both its outputs."""
-
-    def fit(folder):
-        words = smoke_args("vae_alignment", folder / "run", "--trainer.enable_progress_bar=true")
-        words += [f"--trainer.logger={json.dumps([WANDB, CSV])}", "--trainer.callbacks=[]"]
-        folder.mkdir()
-        with (folder / "stdout").open("w") as out, (folder / "stderr").open("w") as errors:
-            command = [sys.executable, "-m", "r3dpa", *words]
-            subprocess.run(command, stdout=out, stderr=errors, timeout=400, check=True)
-
-    folder = make_once("fitted", fit)
-    stdout, stderr = ((folder / name).read_text() for name in ("stdout", "stderr"))
-    return folder / "run", stdout, stderr
-
-
-def test_a_fit_says_what_it_lacks_and_what_follows(fitted):
-    run_dir, _, stderr = fitted
-    ckpt = run_dir / "checkpoints" / "last.ckpt"
-    assert "without --model.init_args.rgb_weights the frozen SiT is random" in stderr
-    assert "global batch: 2 = 2 per process x 1 processes x 1 accumulated" in stderr
-    next_command = f"next: r3dpa fit joint --model.init_args.init_from {ckpt}"
-    assert stderr.splitlines()[-1] == f"checkpoint: {ckpt}; {next_command}"
-
-
-def test_the_bar_of_a_fit_shows_losses_and_no_notices_remain(fitted):
-    _, stdout, stderr = fitted
-    assert "loss=" in stdout
-    assert "reconstruction=" in stdout
-    assert "v_num" not in stdout
-    notices = ("GPU available", "TPU", "Tip", "anonymous", "Seed set", "wandb sync", "sync_dist")
-    assert not [notice for notice in notices if notice in stdout + stderr]
 
 
 def test_a_fit_logs_its_configuration_to_wandb(fitted):
