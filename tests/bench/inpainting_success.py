@@ -12,7 +12,7 @@ object, or of what the sensor sees of it, and span at least 0.3 of its width and
 length. ``unchanged``: share of scans whose pixels outside the mask are the same in all draws.
 
 Mixing: scenes of two halves of scans; mean cosine of the teacher's cells of a half with its own and
-the other source. A core takes 13 s per draw of a box, guided and unguided.
+the other source. A core takes 11 s per draw of a box, guided and unguided.
 """
 
 from __future__ import annotations
@@ -128,8 +128,7 @@ def inpainting(editors, scans, library, teacher, name, draws):
             start = time.perf_counter()
             made = editor.inpaint(pixels, mask, indices, feature=features[how])
             seconds = (time.perf_counter() - start) / draws
-            grid_size = generator.sit.grid_size
-            made = most_like_first(made, mask, feature, teacher.extractor, grid_size)
+            made = most_like_first(made, mask, feature, teacher.extractor, generator.sit.grid_size)
             found = []
             for scene in made:
                 points = points_made(scene, pixels, projection)
