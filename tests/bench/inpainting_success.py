@@ -29,8 +29,8 @@ import torch
 import torch.nn.functional as F
 
 from r3dpa.cli.features import read_data
-from r3dpa.data.datasets import PointSample, points_at_pixels
-from r3dpa.data.feature_grids import pooled_grids
+from r3dpa.data.datasets import points_at_pixels
+from r3dpa.data.feature_grids import grid_of_points
 from r3dpa.data.scans import evenly
 from r3dpa.editing import EditSettings, SceneEditor, most_like_first
 from r3dpa.editing.objects import ObjectLibrary
@@ -62,8 +62,7 @@ class Teacher:
     @torch.no_grad()
     def grid(self, points, projection, grid_size):
         """Feature grid ``(N, F)`` of points ``(P, 4)``."""
-        sample = PointSample(None, None, points, self.extractor.prepare(points))
-        return pooled_grids(self.extractor, [sample], projection, [grid_size])[grid_size][0]
+        return grid_of_points(self.extractor, points, projection, grid_size)
 
 
 def points_made(scene, scan, projection):

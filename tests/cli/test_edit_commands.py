@@ -2,6 +2,7 @@
 
 import json
 import multiprocessing
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from r3dpa.cli import edit_session, main
 from r3dpa.data import read_scan, write_bin, write_npz, write_ply
 from r3dpa.data.labels import read_labels
 from r3dpa.editing import SceneEditor
+from r3dpa.editing.objects import ObjectLibrary
 from r3dpa.geometry import (
     points_of,
     project_pixels,
@@ -122,6 +124,15 @@ class TestFiles:
         # A second edit leaves nothing of the first.
         edit(files, "vary", tmp_path / "again", "--scan", files / "a.bin", "--overwrite")
         assert not (tmp_path / "again" / "mask.png").exists()
+
+    def test_draws_keep_their_order_without_weights_of_the_source(self, files, no_sheet, tmp_path):
+        checkpoint(tmp_path, "scalr")
+        library = ObjectLibrary.load(files / "lib.safetensors")
+        replace(library, extractor={"name": "scalr"}).save(tmp_path / "scalr.objects")
+        box = ["--scan", files / "a.bin", "--box", "-40", "40", "-20", "0", "--object", "car"]
+        about = edit(tmp_path, "inpaint", tmp_path / "o", *box, ckpt="scalr")
+        assert about["draws"] is about["likeness"] is None
+        assert len(about["cosine"]) == 2
 
     def test_labels_beside_a_scan_stay_outside_of_the_mask(self, files, no_sheet, tmp_path):
         labelled_checkpoint(tmp_path)
@@ -272,7 +283,8 @@ class TestComplete:
 REFUSED = [
     ("inpaint", "", "one of --box, --box3d and --mask"),
     ("inpaint", "--mask m.png --objects lib.safetensors", "--objects FILE needs --object NAME"),
-    ("inpaint", "--mask m.png --strength 0.3", "--strength and --window need"),
+    ("inpaint", "--mask m.png --strength 0.3", "--strength, --window and --fe.* need"),
+    ("inpaint", "--mask m.png --features_ckpt f.pth", "--strength, --window and --fe.* need"),
     (
         "inpaint",
         "--ckpt waffleiron-s.safetensors --mask m.png --objects lib.safetensors --object car",

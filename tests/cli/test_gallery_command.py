@@ -12,6 +12,7 @@ from lidarsim import Semantic
 from r3dpa import SceneGenerator
 from r3dpa.checkpoints import read_checkpoint, save_checkpoint
 from r3dpa.cli import main
+from r3dpa.editing import most_like_first
 from r3dpa.editing.objects import ObjectClass, ObjectLibrary
 from r3dpa.geometry import points_of
 
@@ -63,7 +64,14 @@ def test_data_of_another_sensor_are_refused(tiny_file, tmp_path):
         main(["gallery", "--ckpt", str(tiny_file), "--out", "g.html", "--data", str(data)])
 
 
-def test_classes_and_a_car_where_the_weights_have_them(tmp_path):
+def test_classes_and_a_car_where_the_weights_have_them(tmp_path, monkeypatch):
+    ordered = []
+
+    def recorded(edits, *rest):
+        ordered.append(most_like_first(edits, *rest))
+        return ordered[-1]
+
+    monkeypatch.setattr("r3dpa.editing.most_like_first", recorded)
     path = labelled_checkpoint(tmp_path)
     checkpoint = replace(read_checkpoint(path), feature_source="geometric")
     save_checkpoint(checkpoint, path, overwrite=True)
@@ -78,6 +86,7 @@ def test_classes_and_a_car_where_the_weights_have_them(tmp_path):
     groups = {group["title"]: group["tiles"] for group in made["film"]["groups"]}
     edits = [made["scans"][tile["scan"]]["name"] for tile in groups["Edits of seed 0"]]
     assert edits.count("a car 10 m ahead") == 2
+    assert [len(draws) for draws in ordered] == [8]
     assert len(made["categories"]["semantic"]) > 1
     assert {name for _, name, _ in made["categories"]["semantic"]} <= {
         member.name.lower().replace("_", " ") for member in Semantic

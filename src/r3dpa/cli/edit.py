@@ -71,8 +71,8 @@ def inpaint(
         raise ValueError("give one of --box, --box3d and --mask: the part that is to change")
     if object is None and objects is not None:
         raise ValueError("--objects FILE needs --object NAME, a class of the file")
-    if object is None and (strength, window) != (None, None):
-        raise ValueError("--strength and --window need --object")
+    if object is None and (strength, window, features_ckpt) != (None, None, None):
+        raise ValueError("--strength, --window and --features_ckpt need --object")
     if object is not None:
         ckpt = EditOptions(**options).ckpt
         check_features(ckpt)

@@ -259,20 +259,38 @@ def pooled_grids(
         StoreError: Naming the scan whose features are not finite.
     """
     features = extractor.point_features([sample.prepared for sample in samples])
-    lift = getattr(extractor, "lift", torch.nn.Identity())
     grids: dict[tuple[int, int], list[Tensor]] = {(h, w): [] for h, w in grid_sizes}
     for sample, values in zip(samples, features, strict=True):
-        points = sample.points[:, :3].to(values.device)
-        with torch.autocast(values.device.type, enabled=False):
-            for size, of_size in grids.items():
-                means, _ = pool_cells(points, values, projection, size)
-                of_size.append(lift(means).float().cpu())
-                if not of_size[-1].isfinite().all():
-                    raise StoreError(
-                        f"{sample.scan.path}: extractor {extractor.name} gave NaN or infinite "
-                        "features; run it in float32 or leave this scan out"
-                    )
+        for size, of_size in grids.items():
+            of_size.append(_pooled(extractor, sample.points, values, projection, size))
+            if not of_size[-1].isfinite().all():
+                raise StoreError(
+                    f"{sample.scan.path}: extractor {extractor.name} gave NaN or infinite "
+                    "features; run it in float32 or leave this scan out"
+                )
     return {size: torch.stack(of_size) for size, of_size in grids.items()}
+
+
+def grid_of_points(
+    extractor: Extractor, points: Tensor, projection: Projection, grid_size: tuple[int, int]
+) -> Tensor:
+    """Feature grid ``(N, D)`` float32 on the CPU of points ``(P, 4)`` that are no file."""
+    values = extractor.point_features([extractor.prepare(points)])[0]
+    return _pooled(extractor, points, values, projection, grid_size)
+
+
+def _pooled(
+    extractor: Extractor,
+    points: Tensor,
+    values: Tensor,
+    projection: Projection,
+    grid_size: tuple[int, int],
+) -> Tensor:
+    """Lifted means ``(N, D)`` of the features of points ``(P, 4)``; empty cells are zero."""
+    lift = getattr(extractor, "lift", torch.nn.Identity())
+    with torch.autocast(values.device.type, enabled=False):
+        means, _ = pool_cells(points[:, :3].to(values.device), values, projection, grid_size)
+        return lift(means).float().cpu()
 
 
 def write_feature_grids(

@@ -18,7 +18,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from r3dpa.data.datasets import CachedImages, points_at_pixels
-from r3dpa.data.feature_grids import Extractor
+from r3dpa.data.feature_grids import Extractor, grid_of_points
 from r3dpa.data.labels import CLASS_NAMES, read_labels
 from r3dpa.data.scans import Scan
 from r3dpa.editing.editor import EditResult
@@ -29,7 +29,6 @@ from r3dpa.geometry import (
     Projection,
     in_range,
     labels_of,
-    pool_cells,
     projection_to_dict,
     values_at_returns,
 )
@@ -257,16 +256,14 @@ def most_like_first(
         The edits in that order, with their ``draws`` and ``likeness``.
     """
     tokens, projection = token_mask(pixel_mask, grid_size), edits.projection
-    lift = getattr(extractor, "lift", torch.nn.Identity())
-    likeness = []
+    cosines = []
     for scene in edits:
         points = points_at_pixels(Pixels(scene.range_m, scene.intensity), projection)
-        values = extractor.point_features([extractor.prepare(points)])[0]
-        means, _ = pool_cells(points[:, :3].to(values.device), values, projection, grid_size)
-        cells = lift(means).float().cpu()[tokens]
-        likeness.append(F.cosine_similarity(cells, feature, dim=1).mean())
-    measured = replace(edits, draws=torch.arange(len(edits)), likeness=torch.stack(likeness))
-    return measured[torch.stack(likeness).argsort(descending=True, stable=True)]
+        cells = grid_of_points(extractor, points, projection, grid_size)[tokens]
+        cosines.append(F.cosine_similarity(cells, feature, dim=1).mean())
+    likeness = torch.stack(cosines)
+    measured = replace(edits, draws=torch.arange(len(edits)), likeness=likeness)
+    return measured[likeness.argsort(descending=True, stable=True)]
 
 
 def _labelled_points(
