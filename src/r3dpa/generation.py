@@ -53,7 +53,7 @@ class SceneGenerator:
             :meth:`VelocityNetwork.to_bfloat16_` and :meth:`VAE.decoder_to_bfloat16_`; state and
             solver stay float32.
         guidance: Block and strength of perturbed-attention guidance, for a SiT. Average velocities
-            are never guided.
+            are never guided, though their training may have been.
         autoguidance: Weak model and strength.
         batch_size: Pad smaller batches with zeros, so that the networks see a single shape.
         compile: Compile the networks: minutes before the first scene. Needs ``batch_size``. On a

@@ -42,7 +42,8 @@ class ScheduledVelocity:
         sit: Velocity network.
         compile: Compile its evaluations.
         graphs: Replay them as CUDA graphs.
-        guidance: Perturbed-attention guidance; average velocities are never guided.
+        guidance: Perturbed-attention guidance of velocities. Average velocities are never guided,
+            though their training may have been.
 
     Attributes:
         num_times: Times of the schedule.
@@ -56,7 +57,7 @@ class ScheduledVelocity:
         guidance: PerturbedAttention | None = None,
     ) -> None:
         if guidance is not None:
-            _check_guidance(guidance, sit)
+            check_guidance(guidance, sit)
         self.sit, self.guidance = sit, guidance
         self.num_times = 0
         self._averages = False
@@ -99,15 +100,22 @@ class ScheduledVelocity:
     def _evaluate_velocity(self, latents: Tensor, row: Tensor) -> Tensor:
         if self.guidance is None:
             return self.sit.velocity_at(latents, row)
-        sit = cast(SiT, self.sit)
-        pair = velocity_and_perturbed(sit, latents, row, self.guidance.block)
-        return extrapolated(*pair, self.guidance.scale)
+        return guided_velocity_at(cast(SiT, self.sit), latents, row, self.guidance)
 
     def _evaluate_average(self, latents: Tensor, row: Tensor) -> Tensor:
         return cast(AverageVelocitySiT, self.sit).average_velocity_at(latents, row)
 
 
-def _check_guidance(guidance: PerturbedAttention, sit: VelocityNetwork) -> None:
+def guided_velocity_at(
+    sit: SiT, latents: Tensor, modulations: Tensor, guidance: PerturbedAttention
+) -> Tensor:
+    """Guided velocity ``(B, C, h, w)`` float32 from modulations ``(B, M)`` or ``(1, M)``."""
+    pair = velocity_and_perturbed(sit, latents, modulations, guidance.block)
+    return extrapolated(*pair, guidance.scale)
+
+
+def check_guidance(guidance: PerturbedAttention, sit: VelocityNetwork) -> None:
+    """Refuse guidance of a network that is no SiT, or of a block that it does not have."""
     if not isinstance(sit, SiT):
         raise ValueError(f"perturbed attention is for a SiT, got a {type(sit).__name__}")
     if guidance.block > len(sit.blocks):

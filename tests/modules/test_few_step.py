@@ -8,11 +8,12 @@ from tiny_networks import SIT_ARGS, tiny_checkpoint
 from tiny_stages import ARGUMENTS, QUIET, Observed, TinyData, stage_module, tiny_sit, train
 
 from r3dpa.checkpoints import load_into, read_checkpoint
-from r3dpa.flow import average_times, ode_times
+from r3dpa.flow import PerturbedAttention, ab3, average_times, ode_times
 from r3dpa.flow.average_velocity import TIME_SHIFT
 from r3dpa.modules import FewStep, few_step
 from r3dpa.modules.stage import PathDraws
 from r3dpa.nn import VAE, AverageVelocitySiT, SiT, ThinDecoder
+from r3dpa.nn.perturbed_attention import velocity_and_perturbed
 
 pytestmark = QUIET
 
@@ -65,6 +66,25 @@ def test_points_of_a_trajectory_lie_at_the_times_of_eight_average_steps():
     points = module.solve([3])
     time = average_times(8).to(points)[:, None, None, None]
     torch.testing.assert_close(points[0], points[0, 0] - (1 - time) * slope)
+
+
+@torch.no_grad()
+def test_guided_trajectories_follow_the_velocity_pushed_away_from_no_attention():
+    module = stage_module("few_step", guidance=PerturbedAttention(block=2, scale=3.0))
+    velocity = module.flow_velocity(module.sit)
+    points, time = module.solve([0, 1]), torch.full((2,), 0.5)
+    modulations = module.sit.modulations(time)
+    usual, perturbed = velocity_and_perturbed(module.sit, points[:, 4], modulations, block=2)
+    assert (usual - perturbed).abs().max() > 0.01
+    pushed = perturbed + 3 * (usual - perturbed)
+    torch.testing.assert_close(velocity(points[:, 4], time), pushed)
+    end = ab3(velocity, points[:, 0], ode_times(16, shift=TIME_SHIFT))
+    torch.testing.assert_close(points[:, -1], end)
+
+
+def test_guidance_of_a_block_that_the_flow_does_not_have_is_refused():
+    with pytest.raises(ValueError, match=r"block 9 of the guidance is not in 1\.\.2"):
+        stage_module("few_step", guidance=PerturbedAttention(block=9, scale=1.5))
 
 
 def test_the_noise_of_a_trajectory_depends_on_its_number_and_the_seed():
@@ -198,9 +218,9 @@ def test_processes_take_all_trajectories_in_turn():
     assert taken == Counter(range(16))
 
 
-def test_cached_trajectories_are_those_of_flow_seed_and_precision(monkeypatch, tmp_path):
-    def settings_of(seed=0, precision="32-true", change=None):
-        module, seen = stage_module("few_step", seed=seed), []
+def test_cached_trajectories_are_those_of_flow_seed_precision_and_guidance(monkeypatch, tmp_path):
+    def settings_of(seed=0, precision="32-true", change=None, guidance=None):
+        module, seen = stage_module("few_step", seed=seed, guidance=guidance), []
         if change is not None:
             with torch.no_grad():
                 module.get_parameter(change).add_(1.0)
@@ -223,6 +243,7 @@ def test_cached_trajectories_are_those_of_flow_seed_and_precision(monkeypatch, t
     assert settings_of() == usual
     assert settings_of(seed=1) != usual
     assert settings_of(precision="bf16-mixed") != usual
+    assert settings_of(guidance=PerturbedAttention(block=2, scale=3.0)) != usual
     assert settings_of(change="sit.final_layer.linear.bias") != usual
     # The copied blocks are trained on the trajectories, and do not change them.
     assert settings_of(change="sit.average.final_layer.linear.bias") == usual

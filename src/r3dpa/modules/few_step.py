@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -19,12 +19,14 @@ from r3dpa.data.store import CachedTensors, ItemKey, tensor_cache
 from r3dpa.flow import ab3, average_times, average_velocity_steps, ode_times
 from r3dpa.flow.average_velocity import AVERAGE_STEPS, TIME_SHIFT
 from r3dpa.flow.noise import random_generator
+from r3dpa.flow.solvers import Velocity
 from r3dpa.flow.times import per_sample
 from r3dpa.modules.flow_matching import FlowMatching
 from r3dpa.modules.settings import TimeSampling
 from r3dpa.modules.stage import PathDraws, zero_loss
 from r3dpa.nn import VAE, AverageVelocitySiT, ThinDecoder, VelocityNetwork
 from r3dpa.nn.layers import num_processes
+from r3dpa.scheduled_velocity import check_guidance, guided_velocity_at
 
 _POINTS = 8  # of a trajectory after the noise, see average_times
 _EVERY = 2  # AB3 steps between two points
@@ -55,18 +57,21 @@ class FewStep(FlowMatching):
 
     The copied blocks of an :class:`r3dpa.nn.AverageVelocitySiT` learn the average velocity between
     points of AB3 trajectories of the flow, whose own weights stay as they are: one checkpoint
-    samples with any solver. The trajectories are computed once, into the folder of the cached
-    posteriors, and an interrupted run computes only the missing ones. The thin decoder learns the
-    images that the VAE decodes from the latents of training scans.
+    samples with any solver. With ``guidance`` the trajectories are guided, so that few steps make
+    the scenes of a guided flow without the cost of guidance. The trajectories are computed once,
+    into the folder of the cached posteriors, and an interrupted run computes only the missing
+    ones. The thin decoder learns the images that the VAE decodes from the latents of training
+    scans.
 
-    Source: trajectory regression as in consistency mid-training (Hu et al. 2025).
+    Source: trajectory regression as in consistency mid-training (Hu et al. 2025); of guided
+    velocities: Meng et al., "On distillation of guided diffusion models" (CVPR 2023).
 
     Args:
         vae: Range-image autoencoder; fixed.
         sit: SiT with a copy of its last blocks. Training starts from the copy in ``init_from``, if
             it has one of as many blocks.
         thin_decoder: Decoder to distil; None trains none.
-        trajectories: Number of trajectories, 16 evaluations each in the precision of the steps.
+        trajectories: Number of trajectories, 16 velocities each in the precision of the steps.
         **kwargs: See :class:`FlowMatching`. ``init_from`` is a checkpoint of stage flow_matching,
             joint or few_step, whose averaged SiT is taken; its loss weights ``denoising`` (average
             velocity), ``reconstruction`` and ``returns`` (thin decoder) count here.
@@ -94,6 +99,8 @@ class FewStep(FlowMatching):
         if trajectories < 1:
             raise ValueError(f"trajectories must be at least 1, got {trajectories}")
         super().__init__(vae, sit, **kwargs)
+        if self.guidance is not None:
+            check_guidance(self.guidance, sit)
         if thin_decoder is not None:
             _check_thin_decoder(thin_decoder, vae)
         self.thin_decoder = thin_decoder
@@ -132,6 +139,7 @@ class FewStep(FlowMatching):
             "seed": self.seed,
             "every": _EVERY,
             "precision": trainer.precision,
+            "guidance": None if self.guidance is None else asdict(self.guidance),
         }
         shape = (_POINTS + 1, *self.latent_shape)
         root = Path(self.latents_dir or Path(trainer.default_root_dir) / "latents")
@@ -149,6 +157,17 @@ class FewStep(FlowMatching):
 
         self._cached = fill_cache(trainer, cache, items, points)
 
+    def flow_velocity(self, sit: AverageVelocitySiT) -> Velocity:
+        """Velocity of the flow that the trajectories follow, guided if the stage is."""
+        guidance = self.guidance
+        if guidance is None:
+            return sit.velocity
+
+        def guided(latents: Tensor, time: Tensor) -> Tensor:
+            return guided_velocity_at(sit, latents, sit.modulations(time), guidance)
+
+        return guided
+
     @torch.no_grad()
     def solve(self, indices: list[int]) -> Tensor:
         """Points ``(B, 9, C, h, w)`` of trajectories, at the times of 8 average steps."""
@@ -162,7 +181,8 @@ class FewStep(FlowMatching):
             return x
 
         times = ode_times(_POINTS * _EVERY, shift=TIME_SHIFT)
-        ab3(self.sit.velocity, points[0], times, after_step=keep)
+        velocity = self.flow_velocity(cast(AverageVelocitySiT, self.sit))
+        ab3(velocity, points[0], times, after_step=keep)
         return torch.stack(points, dim=1)
 
     def trainable(self) -> dict[str, nn.Module]:
@@ -208,7 +228,7 @@ class FewStep(FlowMatching):
         """Squared distance of 1 and 4 average steps from the end of AB3; errors of the decoder."""
         sit = cast(AverageVelocitySiT, (self.ema or self).sit)
         errors: dict[str, Tensor | tuple[Tensor, Tensor]] = {}
-        end = ab3(sit.velocity, draws.noise, ode_times(16, shift=TIME_SHIFT))
+        end = ab3(self.flow_velocity(sit), draws.noise, ode_times(16, shift=TIME_SHIFT))
         for num in (1, 4):
             reached = average_velocity_steps(sit.average_velocity, draws.noise, average_times(num))
             errors[f"endpoint_{num}"] = losses.flow_matching_loss(reached, end)
