@@ -227,6 +227,34 @@ def test_azimuths_stand_below_their_columns():
     assert places["-90°"] == pytest.approx(11.5, abs=0.5)
 
 
+def shown_columns(first, last):
+    """Columns that a sheet shows of 1,024, if a part covers those from first to last."""
+    projection = SphericalProjection(LidarSensor(beams=8, columns=1024))
+    parts = np.zeros((8, 1024), np.uint8)
+    parts[3:5, first : last + 1] = 1
+    rows = [viz.EditRow("mask", torch.ones(8, 1024), parts), viz.EditRow("a", torch.ones(8, 1024))]
+    sheet = viz.edit_sheet(rows, ("kept", "new"), projection)
+    limits = {axes.get_xlim() for axes in sheet.axes[:2]}
+    ticks = sheet.axes[1].get_xticks()
+    ((left, right),) = limits
+    assert ((ticks >= left) & (ticks <= right)).all()
+    return left, right
+
+
+@pytest.mark.parametrize(
+    ("part", "expected"),
+    [
+        ((500, 600), (400, 700)),  # as much on both sides
+        ((500, 501), (436, 565)),  # but a 16th of the turn at least
+        ((10, 20), (0, 84)),  # not over the seam
+        ((100, 300), (-0.5, 1023.5)),  # with its surroundings more than half of the turn
+        ((0, 1023), (-0.5, 1023.5)),
+    ],
+)
+def test_a_small_part_is_shown_with_its_surroundings(part, expected):
+    assert shown_columns(*part) == expected
+
+
 def test_a_mask_is_drawn_on_grey_and_colours_its_part_alone():
     parts = np.zeros((8, 16), np.uint8)
     parts[:, 8:] = 1

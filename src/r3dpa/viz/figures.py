@@ -181,6 +181,9 @@ def edit_sheet(
 ) -> Figure:
     """Range images one below the other under their names, with the tints of their parts.
 
+    Where all parts but the first lie in a small piece of the turn, that piece and its surroundings
+    are shown.
+
     Args:
         rows: At least one. Azimuths are written below the last.
         part_names: Names of the parts by number; empty where no row has any.
@@ -192,17 +195,36 @@ def edit_sheet(
         tinted = picture if row.parts is None else _tint_parts(picture, row.parts, part_names)
         pictures.append((row.name, tinted))
     figure, cells = strip_sheet(pictures, projection.sensor, 0.3 if part_names else 0.0)
+    columns = _columns_around_parts(rows)
     for row, axes in zip(rows, cells, strict=True):
+        if columns is not None:
+            axes.set_xlim(*columns)
         outline = row.outline
         if outline is not None and (np.diff(outline, axis=0) != 0).mean() < _MOST_BORDERS:
             for part in np.unique(outline)[1:]:
                 axes.contour(outline == part, [0.5], colors="white", linewidths=1.2)
-    _azimuth_ticks(cells[-1], projection)
+    _azimuth_ticks(cells[-1], projection, 45 if columns is None else 15)
     if part_names:
         named = zip(part_names, part_colours(part_names), strict=True)
         handles = [Patch(color=colour, label=name) for name, colour in named]
         figure.legend(handles=handles, loc="outside lower center", ncols=6, frameon=False)
     return figure
+
+
+def _columns_around_parts(rows: Sequence[EditRow]) -> tuple[int, int] | None:
+    """First and last column to show of rows with a small part; None for the whole turn."""
+    parts = [part for row in rows for part in (row.parts, row.outline) if part is not None]
+    if not parts:
+        return None
+    changed = np.flatnonzero(np.any(parts, axis=(0, 1)))
+    total = parts[0].shape[1]
+    if not len(changed):
+        return None
+    first, last = int(changed[0]), int(changed[-1])
+    beside = max(last - first, total // 16)
+    if last - first + 2 * beside > total // 2:
+        return None
+    return max(0, first - beside), min(total - 1, last + beside)
 
 
 def part_colours(names: Sequence[str]) -> list[str]:
@@ -244,11 +266,15 @@ def draw_birds_eye(
     axes.add_patch(Polygon(EGO_OUTLINE_M, facecolor="tab:red", edgecolor="white", lw=0.5))
 
 
-def _azimuth_ticks(axes: Axes, projection: Projection) -> None:
+def _azimuth_ticks(axes: Axes, projection: Projection, spacing_deg: int) -> None:
+    """Ticks at multiples of the spacing in the columns that are shown."""
     azimuth = projection.ray_angles()[1].rad2deg().numpy()
-    wanted = np.arange(135, -180, -45)
+    wanted = np.arange(180 - spacing_deg, -180, -spacing_deg)
     apart = (azimuth[:, None] - wanted + 180) % 360 - 180
-    axes.set_xticks(np.abs(apart).argmin(axis=0), [f"{value}°" for value in wanted], fontsize=8)
+    columns = np.abs(apart).argmin(axis=0)
+    first, last = axes.get_xlim()
+    shown = (columns >= first) & (columns <= last)
+    axes.set_xticks(columns[shown], [f"{value}°" for value in wanted[shown]], fontsize=8)
     axes.tick_params(length=2, pad=2)
 
 
