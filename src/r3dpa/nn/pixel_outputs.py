@@ -15,8 +15,8 @@ from torch import Tensor
 from r3dpa.nn.layers import at_least_float32
 
 _FLYING_GAP = 0.01  # from both neighbours, encoded: 2 % of the range in log2, 0.28 m in linear
-_RIPPLE = 0.03  # neighbours that much nearer or farther have 1 / e of the weight; 6 % in log2
-_RIPPLE_COLUMNS = 8  # on both sides
+_RIPPLE = 0.015  # neighbours that much nearer or farther have 1 / e of the weight; 3 % in log2
+_RIPPLE_COLUMNS = 12  # on both sides
 
 
 class PixelOutputs(NamedTuple):
@@ -97,7 +97,7 @@ def without_ripples(image: Tensor) -> Tensor:
     """Images whose ranges are smoothed along rings, but not over edges.
 
     A decoder errs from pixel to pixel by about 1 % of the range, a sensor by a few centimetres.
-    Each range becomes a mean of the returns of its ring, 8 columns to both sides, weighted by how
+    Each range becomes a mean of the returns of its ring, 12 columns to both sides, weighted by how
     close they are in range; so outlines and thin poles stay.
 
     Source: Tomasi and Manduchi, "Bilateral filtering for gray and color images" (ICCV 1998), here
