@@ -15,7 +15,7 @@ from torch import Tensor
 from r3dpa.nn.layers import at_least_float32
 
 _FLYING_GAP = 0.01  # from both neighbours, encoded: 2 % of the range in log2, 0.28 m in linear
-_RIPPLE = 0.015  # neighbours that much nearer or farther have 1 / e of the weight; 3 % in log2
+_RIPPLE = 0.02  # neighbours that much nearer or farther have 1 / e of the weight; 4 % in log2
 _RIPPLE_COLUMNS = 12  # on both sides
 
 

@@ -45,6 +45,7 @@ _TINT = 0.55  # share of the colour of a part
 _GREY_SHARES = (0.299, 0.587, 0.114)  # of red, green and blue in their brightness
 _MOST_BORDERS = 0.2  # of the pixels: lines between every few beams would hide the picture
 _KEPT, _GREY = "kept", "#8a8f98"
+_STRIP_IN = 1.2  # height of a range image with its name, a whole turn wide
 
 
 def birds_eye_view(points: Array, extent_m: float = EXTENT_M) -> Figure:
@@ -194,8 +195,10 @@ def edit_sheet(
         picture = range_image_picture(row.range_m, projection.sensor)
         tinted = picture if row.parts is None else _tint_parts(picture, row.parts, part_names)
         pictures.append((row.name, tinted))
-    figure, cells = strip_sheet(pictures, projection.sensor, 0.3 if part_names else 0.0)
     columns = _columns_around_parts(rows)
+    below_in = 0.3 if part_names else 0.0
+    height_in = _STRIP_IN if columns is None else 2 * _STRIP_IN
+    figure, cells = strip_sheet(pictures, projection.sensor, below_in, height_in)
     for row, axes in zip(rows, cells, strict=True):
         if columns is not None:
             axes.set_xlim(*columns)
@@ -234,11 +237,15 @@ def part_colours(names: Sequence[str]) -> list[str]:
 
 
 def strip_sheet(
-    pictures: Sequence[tuple[str, Pixels]], sensor: LidarSensor, below_in: float = 0.0
+    pictures: Sequence[tuple[str, Pixels]],
+    sensor: LidarSensor,
+    below_in: float = 0.0,
+    height_in: float = _STRIP_IN,
 ) -> tuple[Figure, list[Axes]]:
     """Pictures of range images under their names, with the range scale; inches left below."""
     count = len(pictures)
-    figure = Figure(figsize=(13.0, 1.2 * count + 0.6 + below_in), dpi=110, layout="constrained")
+    size_in = 13.0, height_in * count + 0.6 + below_in
+    figure = Figure(figsize=size_in, dpi=110, layout="constrained")
     cells = list(figure.subplots(count, 1, squeeze=False)[:, 0])
     for (name, picture), axes in zip(pictures, cells, strict=True):
         draw_panorama(axes, picture, name)
