@@ -47,7 +47,7 @@ ALLOWED = {
         "data",
         "lidarsim",
     },
-    "modules": METHOD,
+    "modules": METHOD | {"scheduled_velocity"},
     # Divergences that realism has, too.
     "metrics": {"geometry", "nn", "features", "lidarsim", "feature_names"},
     "viz": METHOD | {"metrics"},
