@@ -109,7 +109,14 @@ class ScheduledVelocity:
 def guided_velocity_at(
     sit: SiT, latents: Tensor, modulations: Tensor, guidance: PerturbedAttention
 ) -> Tensor:
-    """Guided velocity ``(B, C, h, w)`` float32 from modulations ``(B, M)`` or ``(1, M)``."""
+    """Velocity ``(B, C, h, w)`` float32 under perturbed-attention guidance.
+
+    Args:
+        sit: Velocity network.
+        latents: ``(B, C, h, w)`` noisy normalised latents.
+        modulations: ``(B, M)``, or ``(1, M)`` for all samples, see :meth:`SiT.modulations`.
+        guidance: Perturbed block and strength; gives the source.
+    """
     pair = velocity_and_perturbed(sit, latents, modulations, guidance.block)
     return extrapolated(*pair, guidance.scale)
 

@@ -82,6 +82,17 @@ def test_guided_trajectories_follow_the_velocity_pushed_away_from_no_attention()
     torch.testing.assert_close(points[:, -1], end)
 
 
+@torch.no_grad()
+def test_the_end_that_held_out_errors_compare_with_is_guided(monkeypatch):
+    module = stage_module("few_step", guidance=PerturbedAttention(block=2, scale=3.0))
+    module.thin_decoder = None
+    noise = module.solve([0])[:, 0]
+    monkeypatch.setattr(few_step, "average_velocity_steps", lambda _, x, grid: 0 * x)
+    errors = module.held_out_errors(noise, noise, PathDraws(noise, torch.zeros(1), noise))
+    end = module.solve([0])[:, -1]
+    torch.testing.assert_close(errors["endpoint_1"], end.square().mean(dim=(1, 2, 3)))
+
+
 def test_guidance_of_a_block_that_the_flow_does_not_have_is_refused():
     with pytest.raises(ValueError, match=r"block 9 of the guidance is not in 1\.\.2"):
         stage_module("few_step", guidance=PerturbedAttention(block=9, scale=1.5))

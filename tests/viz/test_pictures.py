@@ -237,6 +237,8 @@ def shown_columns(first, last):
     limits = {axes.get_xlim() for axes in sheet.axes[:2]}
     ticks = sheet.axes[1].get_xticks()
     ((left, right),) = limits
+    tall = sheet.get_figheight() > 2 * 2 * 1.2
+    assert tall == (right - left < 1023)
     assert ((ticks >= left) & (ticks <= right)).all()
     return left, right
 

@@ -158,7 +158,7 @@ class FewStep(FlowMatching):
         self._cached = fill_cache(trainer, cache, items, points)
 
     def flow_velocity(self, sit: AverageVelocitySiT) -> Velocity:
-        """Velocity of the flow that the trajectories follow, guided if the stage is."""
+        """Function ``(x (B, C, h, w), time (B,))`` to the velocity that trajectories follow."""
         guidance = self.guidance
         if guidance is None:
             return sit.velocity
