@@ -142,10 +142,10 @@ def test_a_recorded_geometry_without_the_newer_options_is_read():
 @pytest.mark.parametrize(
     ("returns", "kept"), [(0.9, 900), (0.995, 995), (0.69, 1000), (0.3, 0)], ids=str
 )
-def test_likely_returns_are_kept_as_often_as_their_probability_says(returns, kept):
+def test_likely_returns_are_kept_as_often_as_their_scaled_logit_says(returns, kept):
     codec = RangeCodec(return_channel=True)
     image = torch.full((3, 2, 1, 1000), 0.2)
-    image[:, 1] = torch.tensor(returns).logit()
+    image[:, 1] = torch.tensor(returns).logit() / 1.3
     uniform = (torch.arange(1000) + 0.5).expand(3, 1, 1000) / 1000
     found = codec.drop_returns(image, uniform)
     assert codec.returns_of(found).sum(dim=(1, 2, 3)).tolist() == [kept] * 3

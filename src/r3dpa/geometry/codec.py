@@ -27,6 +27,7 @@ _PROJECTIONS = {
 }
 _ROUNDING_M = 1e-3
 _LIKELY_RETURN = 0.7
+_LOGIT_SCALE = 1.3  # with which reconstructions have as many returns as their scans
 _DEFAULT_SCALES = {"linear": 56.0, "log2": 5.84, "inverse": 1.45}
 _LOG_OFFSET_M = 1e-4
 _LEAST_VALID_M = 1 / 255  # one grey level of a metre in the official 8-bit pictures
@@ -265,13 +266,14 @@ class RangeCodec:
 
         Sensors lose single shots. Latents do not tell which, so the most likely image has no such
         holes. Only pixels with a likely return are drawn, since independent draws would fray the
-        borders of large holes.
+        borders of large holes. Other pixels take the likelier outcome, which loses more returns
+        than it adds; larger logits make up for that.
 
         Args:
             image: ``(..., C, H, W)``, whose second channel is the logit of a return.
             uniform: ``(..., H, W)`` in [0, 1).
         """
-        returns = image[..., 1, :, :].sigmoid()
+        returns = (_LOGIT_SCALE * image[..., 1, :, :]).sigmoid()
         dropped = (returns > _LIKELY_RETURN) & (uniform > returns)
         return image.masked_fill(dropped.unsqueeze(-3), -1.0)
 
