@@ -14,6 +14,8 @@ from r3dpa.baselines import BASELINES, baseline_of
 from r3dpa.baselines.lidm_networks import VQAutoencoder
 from r3dpa.checkpoints import Checkpoint, NetworkState, read_checkpoint, save_checkpoint
 from r3dpa.cli import main
+from r3dpa.cli.edit_session import EditSession
+from r3dpa.cli.parser import EditOptions
 from r3dpa.flow.sampler import SamplerConfig
 from r3dpa.stages import scene_generator
 
@@ -110,6 +112,11 @@ def test_edit_complete(trained, smoke_root, tmp_path):
         main(["edit", "vary", *words])
     with pytest.raises(ValueError, match=f"stage {stage} starts from noise"):
         main(["edit", "complete", "--keep_every", "2", "--start", "0.5", *words])
+
+
+def test_completions_take_32_steps_by_default(trained, tmp_path):
+    options = EditOptions(out=tmp_path, ckpt=trained[1], device="cpu")
+    assert EditSession(options, 1).baseline.sampler.steps == 32
 
 
 def test_the_published_sampler_is_the_default(trained):

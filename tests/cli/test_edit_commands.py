@@ -15,6 +15,7 @@ from lidarsim import simulate
 from lidarsim.clouds import read_cloud
 from r3dpa import viz
 from r3dpa.cli import edit_session, main
+from r3dpa.cli.parser import EditOptions
 from r3dpa.data import read_scan, write_bin, write_npz, write_ply
 from r3dpa.data.labels import read_labels
 from r3dpa.editing import SceneEditor
@@ -77,6 +78,11 @@ def images(files, name="a"):
 def no_sheet(monkeypatch):
     """The sheet takes longer than a tiny edit; one test draws it."""
     monkeypatch.setattr(viz, "edit_sheet", lambda *_: np.zeros((2, 2, 3), np.uint8))
+
+
+def test_edits_take_16_steps_by_default(files, tmp_path):
+    options = EditOptions(out=tmp_path, ckpt=files / "geometric.safetensors", device="cpu")
+    assert edit_session.EditSession(options, 1).settings.steps == 16
 
 
 class TestFiles:

@@ -32,10 +32,12 @@ def inpaint(
     """Generate a part of a scan anew, as an object if one is named.
 
     The part is one of --box, --box3d and --mask; pixels outside it keep the scan's values. The
-    object is a class of the mean features beside the weights, such as car, pedestrian, tree or
-    pole, or of a file (--objects FILE --object car); without one the edit is unguided. Not every
-    draw becomes the object: the feature source looks at all of them, and the one that is most like
-    it comes first. Azimuth 0 looks forward and grows to the left; 180 is behind.
+    object is a class of the mean features beside the weights, such as car or tree, or of a file
+    (--objects FILE --object car); without one the edit is unguided. Not every draw becomes the
+    object: the feature source looks at all of them, and the one that is most like it comes first.
+    With r3dpa-s, objects much smaller than a cell of its feature grid (11 degrees), such as poles
+    and pedestrians, hardly ever appear. Azimuth 0 looks forward and grows to the left; 180 is
+    behind.
 
     Args:
         scan: Scan to edit: ``.bin``, ``.ply``, or ``.npz`` of one scan.

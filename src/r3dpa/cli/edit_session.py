@@ -39,6 +39,7 @@ from r3dpa.stages import BASELINE_STAGES, scene_generator
 from r3dpa.viz.scenes import draw_scene
 
 _SHOWN = 8  # results on the sheet and the page
+_BASELINE_STEPS = 32
 
 
 class ScanView(NamedTuple):
@@ -64,14 +65,18 @@ class EditSession:
     ) -> None:
         self.options, self.num = options, num
         strength, window = 0.5 if strength is None else strength, window or (0.0, 1.0)
-        self.settings = EditSettings(options.solver, options.steps, options.shift, strength, window)
         self.device = usable_device(options.device)
         self.checkpoint = read_checkpoint(options.ckpt)
+        is_baseline = self.checkpoint.stage in BASELINE_STAGES
+        steps = options.steps
+        if steps is None:
+            steps = _BASELINE_STEPS if is_baseline else EditSettings.steps
+        self.settings = EditSettings(options.solver, steps, options.shift, strength, window)
         shared: Any = {"weights": options.weights, "device": self.device}
         generator: Any
         self.baseline: Any = None
-        if self.checkpoint.stage in BASELINE_STAGES:
-            sampler = SamplerConfig("ddpm", options.steps)
+        if is_baseline:
+            sampler = SamplerConfig("ddpm", steps)
             self.baseline = generator = scene_generator(self.checkpoint, sampler, **shared)
             self._called = generator.network
         else:
@@ -227,7 +232,7 @@ class EditSession:
         if not guided:
             del settings["strength"], settings["window"]
         if self.baseline is not None:
-            settings = {"steps": options.steps}
+            settings = {"steps": self.settings.steps}
         left_out = ("options", "num", "workers")
         request = {name: value for name, value in arguments.items() if name not in left_out}
         request |= {"columns": options.columns} if options.columns else {}
@@ -238,7 +243,7 @@ class EditSession:
     @contextmanager
     def _progress(self, command: str) -> Iterator[None]:
         """Bar of network evaluations of whole batches, to noise and back."""
-        steps = evaluations(self.options.solver, self.options.steps)
+        steps = evaluations(self.options.solver, self.settings.steps)
         batches = math.ceil(self.num / self.options.batch_size)
         total = steps * (batches + 1)
         with tqdm(total=total, unit="evaluation", desc=command, disable=None) as bar:
