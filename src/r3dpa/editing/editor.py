@@ -46,8 +46,8 @@ class EditSettings:
         solver: A key of :data:`r3dpa.flow.ODE_SOLVERS`. Midpoint steps have by far the smallest
             round-trip error per evaluation.
         steps: Solver steps from noise to data. With 16 of ``midpoint``, scans come back from noise
-            within 3 cm of what the VAE of `r3dpa-s` makes of them, with 32 within 0.4 cm; cars
-            appear as often.
+            with a mean error of 3 cm beside what the VAE of `r3dpa-s` makes of them, with 32 of
+            0.4 cm; cars appear as often.
         shift: Finer steps near noise (above 1) or data (below 1).
         strength: Length of the guidance term relative to the velocity, in [0, 1]; 0 for none.
         window: First and last guided time; 0 is data, 1 noise.
