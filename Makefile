@@ -121,7 +121,7 @@ demo: $(READY)
 	rm -rf '$(OUT)/vae' '$(OUT)/flow' '$(OUT)/reference.safetensors'
 	$(BIN)/r3dpa sample --num 16 --out '$(OUT)/r3dpa-s' --overwrite true
 	$(BIN)/r3dpa edit inpaint --scan '$(OUT)/r3dpa-s/bin/000000.bin' --box -30 30 -25 3 --num 2 \
-		--steps 16 --out '$(OUT)/edit' --overwrite true
+		--out '$(OUT)/edit' --overwrite true
 	$(BIN)/r3dpa data reference --data '$(REAL)' --num 32 --out '$(OUT)/reference.safetensors'
 	$(BIN)/r3dpa evaluate --samples '$(OUT)/r3dpa-s' --reference '$(OUT)/reference.safetensors' \
 		--allow_few --label before --out '$(OUT)/before'

@@ -12,7 +12,7 @@ object, or of what the sensor sees of it, and span at least 0.3 of its width and
 length. ``unchanged``: share of scans whose pixels outside the mask are the same in all draws.
 
 Mixing: scenes of two halves of scans; mean cosine of the teacher's cells of a half with its own and
-the other source. A core takes 11 s per draw of a box, guided and unguided.
+the other source. A core takes 5 s per draw of a box, guided and unguided.
 """
 
 from __future__ import annotations

@@ -65,17 +65,15 @@ class EditSession:
     ) -> None:
         self.options, self.num = options, num
         strength, window = 0.5 if strength is None else strength, window or (0.0, 1.0)
+        steps = EditSettings.steps if options.steps is None else options.steps
+        self.settings = EditSettings(options.solver, steps, options.shift, strength, window)
         self.device = usable_device(options.device)
         self.checkpoint = read_checkpoint(options.ckpt)
-        is_baseline = self.checkpoint.stage in BASELINE_STAGES
-        steps = options.steps
-        if steps is None:
-            steps = _BASELINE_STEPS if is_baseline else EditSettings.steps
-        self.settings = EditSettings(options.solver, steps, options.shift, strength, window)
         shared: Any = {"weights": options.weights, "device": self.device}
         generator: Any
         self.baseline: Any = None
-        if is_baseline:
+        if self.checkpoint.stage in BASELINE_STAGES:
+            steps = _BASELINE_STEPS if options.steps is None else options.steps
             sampler = SamplerConfig("ddpm", steps)
             self.baseline = generator = scene_generator(self.checkpoint, sampler, **shared)
             self._called = generator.network
@@ -232,7 +230,7 @@ class EditSession:
         if not guided:
             del settings["strength"], settings["window"]
         if self.baseline is not None:
-            settings = {"steps": self.settings.steps}
+            settings = {"steps": self.baseline.sampler.steps}
         left_out = ("options", "num", "workers")
         request = {name: value for name, value in arguments.items() if name not in left_out}
         request |= {"columns": options.columns} if options.columns else {}

@@ -27,7 +27,7 @@ _PROJECTIONS = {
 }
 _ROUNDING_M = 1e-3
 _LIKELY_RETURN = 0.7
-_LOGIT_SCALE = 1.3  # with which reconstructions have as many returns as their scans
+_LOGIT_SCALE = 1.3  # reconstructions of r3dpa-s then have as many returns as their 120 scans
 _DEFAULT_SCALES = {"linear": 56.0, "log2": 5.84, "inverse": 1.45}
 _LOG_OFFSET_M = 1e-4
 _LEAST_VALID_M = 1 / 255  # one grey level of a metre in the official 8-bit pictures
