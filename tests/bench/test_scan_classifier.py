@@ -1,6 +1,8 @@
 import pytest
 import torch
-from scan_classifier import classifier_accuracy
+from scan_classifier import classifier_accuracy, evidence_of, train_classifier
+
+from r3dpa.geometry import RangeCodec
 
 
 def scenes(count, seed, speckle=0.0):
@@ -26,3 +28,14 @@ def test_sets_that_cannot_be_compared_are_refused():
         classifier_accuracy(scenes(8, 0), scenes(8, 1)[:, :8])
     with pytest.raises(ValueError, match="at least 4"):
         classifier_accuracy(scenes(8, 0), scenes(3, 1))
+
+
+def test_evidence_of_the_cells_averages_to_the_logit_and_lies_where_the_speckle_is():
+    real, speckled = scenes(60, 0), scenes(60, 1, 0.05)
+    half = torch.cat([scenes(60, 1)[..., :32], speckled[..., 32:]], dim=-1)
+    trained = train_classifier(real, half, epochs=12)
+    evidence = evidence_of(trained.network, trained.generated_m)
+    logits = trained.network(RangeCodec("log2", return_channel=True).to_image(trained.generated_m))
+    assert evidence.shape == (18, 1, 4)
+    torch.testing.assert_close(evidence.mean((1, 2)), logits[:, 0].detach())
+    assert evidence[..., 2:].mean() > evidence[..., :2].mean() + 0.3
