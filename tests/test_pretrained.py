@@ -15,7 +15,7 @@ from tiny_networks import tiny_checkpoint, tiny_networks
 from r3dpa import SceneGenerator, SceneVAE, pretrained
 from r3dpa.checkpoints import convert, load_into, read_checkpoint, save_checkpoint
 from r3dpa.cli import main
-from r3dpa.cli.scene_files import written
+from r3dpa.scene_files.generated import written
 
 
 @pytest.fixture

@@ -42,6 +42,8 @@ __all__ = [
     "Journal",
     "append",
     "atomic_path",
+    "check_file",
+    "check_folder",
     "command",
     "delete_unfinished",
     "differences",
@@ -135,3 +137,17 @@ def one_line(values: str | dict[str, Any]) -> str:
     """A text as it is, or names and values in one line."""
     pairs = values.items() if isinstance(values, dict) else ()
     return ", ".join(f"{name} {value}" for name, value in pairs) or str(values)
+
+
+def check_folder(out: Path | None) -> None:
+    """Refuse an output folder whose path is a file, before the work starts."""
+    for folder in () if out is None else (out, *out.parents):
+        if folder.is_file():
+            raise ValueError(f"{folder} is a file; give another --out")
+
+
+def check_file(out: Path | None) -> None:
+    """Refuse an output file whose path is a folder, before the work starts."""
+    if out is not None and out.is_dir():
+        raise ValueError(f"{out} is a folder; give --out the name of a file")
+    check_folder(None if out is None else out.parent)

@@ -14,9 +14,9 @@ from r3dpa.baselines import BASELINES, baseline_of
 from r3dpa.baselines.lidm_networks import VQAutoencoder
 from r3dpa.checkpoints import Checkpoint, NetworkState, read_checkpoint, save_checkpoint
 from r3dpa.cli import main
-from r3dpa.cli.edit_session import EditSession
-from r3dpa.cli.parser import EditOptions
 from r3dpa.flow.sampler import SamplerConfig
+from r3dpa.scene_files.edits import EditSession
+from r3dpa.scene_files.options import EditOptions
 from r3dpa.stages import scene_generator
 
 

@@ -14,8 +14,7 @@ from tiny_networks import GEOMETRY, tiny_checkpoint
 from lidarsim import simulate
 from lidarsim.clouds import read_cloud
 from r3dpa import viz
-from r3dpa.cli import edit_session, main
-from r3dpa.cli.parser import EditOptions
+from r3dpa.cli import main
 from r3dpa.data import read_scan, write_bin, write_npz, write_ply
 from r3dpa.data.labels import read_labels
 from r3dpa.editing import SceneEditor
@@ -25,6 +24,8 @@ from r3dpa.geometry import (
     project_pixels,
     range_image,
 )
+from r3dpa.scene_files import edits
+from r3dpa.scene_files.options import EditOptions
 
 PROJECTION = GEOMETRY.projection
 SENSOR = PROJECTION.sensor
@@ -82,7 +83,7 @@ def no_sheet(monkeypatch):
 
 def test_edits_take_16_steps_by_default(files, tmp_path):
     options = EditOptions(out=tmp_path, ckpt=files / "geometric.safetensors", device="cpu")
-    assert edit_session.EditSession(options, 1).settings.steps == 16
+    assert edits.EditSession(options, 1).settings.steps == 16
 
 
 class TestFiles:
@@ -329,7 +330,7 @@ def test_bad_input_is_refused_before_networks_run(
 def test_a_model_without_features_is_refused_before_anything_is_loaded(files, monkeypatch, words):
     monkeypatch.chdir(files)
     monkeypatch.setattr("r3dpa.checkpoints.files.load_file", lambda *_: pytest.fail("loaded"))
-    monkeypatch.setattr(edit_session, "read_checkpoint", lambda *_: pytest.fail("loaded"))
+    monkeypatch.setattr(edits, "read_checkpoint", lambda *_: pytest.fail("loaded"))
     with pytest.raises(ValueError, match=r"None.safetensors was trained without 3D features"):
         main([*words.split(), "--ckpt", "None.safetensors"])
 

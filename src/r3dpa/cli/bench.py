@@ -15,8 +15,8 @@ import yaml
 from jsonargparse.typing import PositiveInt
 
 from r3dpa.cli.messages import suggestion
-from r3dpa.cli.parser import check_file, check_folder
 from r3dpa.cli.presets import conf_folder, shipped
+from r3dpa.io import check_file, check_folder
 
 
 def training(

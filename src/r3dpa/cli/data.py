@@ -8,7 +8,7 @@ from typing import Any
 
 from jsonargparse.typing import PositiveFloat, PositiveInt
 
-from r3dpa.cli.parser import check_file, check_folder
+from r3dpa.io import check_file, check_folder
 from r3dpa.pretrained import DEFAULT_WEIGHTS, OBJECTS_SUFFIX, check_features
 
 _FRAME_NOTE = (
@@ -84,9 +84,9 @@ def view(
             values.
     """
     from r3dpa import viz
-    from r3dpa.cli.scene_files import page_scans
     from r3dpa.data.scans import evenly
     from r3dpa.geometry import LidarSensor, SphericalProjection
+    from r3dpa.scene_files.generated import page_scans
     from r3dpa.viz.scenes import write_page
 
     check_folder(out)
@@ -137,13 +137,13 @@ def objects(
 
     from r3dpa.checkpoints import read_checkpoint
     from r3dpa.cli.features import read_data
-    from r3dpa.cli.scene_files import feature_source_of
     from r3dpa.data import find_scans
     from r3dpa.data.scans import evenly
     from r3dpa.editing.objects import object_library
     from r3dpa.features import feature_source
     from r3dpa.generation import SceneGenerator
     from r3dpa.io import text_table, usable_device
+    from r3dpa.scene_files.generated import feature_source_of
 
     source = feature_source_of(read_checkpoint(ckpt))
     generator = SceneGenerator.from_checkpoint(ckpt, device="cpu")

@@ -8,9 +8,9 @@ from typing import Any
 
 from jsonargparse.typing import PositiveInt
 
-from r3dpa.cli.parser import EditOptions
 from r3dpa.feature_names import OWN_WEIGHTS
 from r3dpa.pretrained import check_features, objects_file
+from r3dpa.scene_files.options import EditOptions
 
 
 def inpaint(
@@ -79,10 +79,10 @@ def inpaint(
         ckpt = EditOptions(**options).ckpt
         check_features(ckpt)
         arguments["objects"] = objects = objects or objects_file(ckpt)
-    from r3dpa.cli.edit_session import EditSession
-    from r3dpa.cli.scene_files import feature_source_of
     from r3dpa.editing import EditResult, most_like_first, regions
     from r3dpa.editing.objects import ObjectLibrary
+    from r3dpa.scene_files.edits import EditSession
+    from r3dpa.scene_files.generated import feature_source_of
 
     session = EditSession(EditOptions(**options), num, strength, window)
     source = session.read(scan)
@@ -156,8 +156,8 @@ def mix(
         "window": window,
     }
     check_features(EditOptions(**options).ckpt)
-    from r3dpa.cli.edit_session import EditSession
     from r3dpa.editing.regions import mask_of_tokens, sector_weights
+    from r3dpa.scene_files.edits import EditSession
 
     session = EditSession(EditOptions(**options), num, strength, window)
     paths = enumerate((left, right))
@@ -226,7 +226,7 @@ def complete(
             "nothing is missing: give --sector, --keep_every, --empty_beams, --other_sensor or "
             "--mask"
         )
-    from r3dpa.cli.edit_complete import CompletionJob, MissingPixels, complete_files
+    from r3dpa.scene_files.completions import CompletionJob, MissingPixels, complete_files
 
     missing = MissingPixels(sector, keep_every, empty_beams, other_sensor, mask)
     job = CompletionJob(EditOptions(**options), missing, num, start, resamplings)
@@ -243,7 +243,7 @@ def vary(*, scan: Path, start: float = 0.5, num: PositiveInt = 8, **options: Any
         **options: See :class:`EditOptions`.
     """
     arguments = {"scan": scan, "start": start}
-    from r3dpa.cli.edit_session import EditSession
+    from r3dpa.scene_files.edits import EditSession
 
     session = EditSession(EditOptions(**options), num)
     source = session.read(scan)
@@ -263,7 +263,7 @@ def interpolate(*, left: Path, right: Path, frames: int = 8, **options: Any) -> 
     arguments = {"left": left, "right": right, "frames": frames}
     if frames < 2:
         raise ValueError(f"frames must be at least 2, the two scans; got {frames}")
-    from r3dpa.cli.edit_session import EditSession
+    from r3dpa.scene_files.edits import EditSession
 
     session = EditSession(EditOptions(**options), frames)
     first, last = session.read(left), session.read(right)

@@ -11,8 +11,8 @@ from typing import Any, Literal
 
 from jsonargparse.typing import PositiveInt
 
-from r3dpa.cli.parser import check_file, check_folder
 from r3dpa.feature_names import FeatureSpace
+from r3dpa.io import check_file, check_folder
 
 
 def reference(

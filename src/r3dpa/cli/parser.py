@@ -1,4 +1,4 @@
-"""Parser of a command from the function that does the work; options that commands share."""
+"""Parser of a command from the function that does the work."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import json
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, is_dataclass
+from dataclasses import is_dataclass
 from importlib import import_module
 from inspect import cleandoc
 from pathlib import Path
 from types import UnionType
-from typing import Any, Literal, NoReturn, Union, cast, get_args, get_origin
+from typing import Any, NoReturn, Union, cast, get_args, get_origin
 
 import yaml
 from jsonargparse import (
@@ -23,11 +23,10 @@ from jsonargparse import (
     set_loader,
     set_parsing_settings,
 )
-from jsonargparse.typing import NonNegativeInt, PositiveInt
 
 from r3dpa.class_paths import current_path, with_current_paths
 from r3dpa.cli.messages import ALLOWED_PACKAGES, describe_error
-from r3dpa.pretrained import DEFAULT_WEIGHTS, weights_file
+from r3dpa.pretrained import weights_file
 
 # An argument of any type gets plain values alone: the classes of other packages, and those that
 # nothing restricts to a base class, can start a shell.
@@ -247,69 +246,3 @@ def _check_inputs(parser: Parser, arguments: Mapping[str, Any]) -> None:
         if isinstance(path, Path) and not path.exists():
             option = f"--{name} " if name in options else ""
             raise ValueError(f"{option}{path}: no such file or folder")
-
-
-ODESolver = Literal["euler", "heun", "midpoint", "ab2", "ab3", "dpmpp_2m", "unipc"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class SceneOptions:
-    """Checkpoint that generates scenes, and files that they are written to.
-
-    Args:
-        ckpt: Checkpoint of stage joint or flow_matching, ``.ckpt`` or exported ``.safetensors``, a
-            name of ``r3dpa models``, or ``hf://owner/name``.
-        out: Folder for scenes, pictures, page and metadata; must not hold other scenes.
-        seed: Scene i depends on (seed, i) alone, not on the batch size.
-        batch_size: Scenes generated together.
-        device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
-        weights: Averaged (``ema``) or last weights of the SiT.
-        formats: Files of points: ``bin``, ``ply``, ``npz``; ``range_m.npy`` is always written.
-        pictures: Number of scenes to draw.
-        overwrite: Replace the scenes of a folder.
-    """
-
-    out: Path
-    ckpt: Path = Path(DEFAULT_WEIGHTS)
-    seed: NonNegativeInt = 0
-    batch_size: PositiveInt = 8
-    device: str = "auto"
-    weights: Literal["ema", "last"] = "ema"
-    formats: tuple[Literal["bin", "ply", "npz"], ...] = ("bin",)
-    pictures: NonNegativeInt = 16
-    overwrite: bool = False
-
-    def __post_init__(self) -> None:
-        check_folder(self.out)
-
-
-@dataclass(frozen=True, kw_only=True)
-class EditOptions(SceneOptions):
-    """Options shared by all edits.
-
-    Args:
-        solver: ODE solver, to noise and back; ``midpoint`` has the least error there and back.
-        steps: Solver steps from data to noise; default: 16, of baselines 32.
-        shift: Finer steps near noise (above 1) or data (below 1).
-        columns: Columns of files without names, such as ``x,y,z,intensity,ring``; default: by the
-            values.
-    """
-
-    solver: ODESolver = "midpoint"
-    steps: int | None = None
-    shift: float = 1.0
-    columns: tuple[str, ...] = ()
-
-
-def check_folder(out: Path | None) -> None:
-    """Refuse an output folder whose path is a file, before the work starts."""
-    for folder in () if out is None else (out, *out.parents):
-        if folder.is_file():
-            raise ValueError(f"{folder} is a file; give another --out")
-
-
-def check_file(out: Path | None) -> None:
-    """Refuse an output file whose path is a folder, before the work starts."""
-    if out is not None and out.is_dir():
-        raise ValueError(f"{out} is a folder; give --out the name of a file")
-    check_folder(None if out is None else out.parent)

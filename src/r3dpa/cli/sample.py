@@ -7,9 +7,10 @@ from typing import Any, Literal
 
 from jsonargparse.typing import NonNegativeInt, PositiveInt
 
-from r3dpa.cli.parser import ODESolver, SceneOptions, check_file
 from r3dpa.feature_names import OWN_WEIGHTS
+from r3dpa.io import check_file
 from r3dpa.pretrained import DEFAULT_WEIGHTS, OBJECTS_SUFFIX, weights_file
+from r3dpa.scene_files.options import ODESolver, SceneOptions
 
 
 def sample(
@@ -64,13 +65,13 @@ def sample(
     from dataclasses import asdict, replace
 
     from r3dpa.checkpoints import read_checkpoint, read_snapshot
-    from r3dpa.cli.scene_files import generate_all, provenance, written
     from r3dpa.data.scene_writer import SceneWriter
     from r3dpa.flow.sampler import Quality
     from r3dpa.generation import Autoguidance, SamplerConfig, geometry_of
     from r3dpa.geometry import projection_for
     from r3dpa.io import usable_device
     from r3dpa.nn import ThinDecoder
+    from r3dpa.scene_files.generated import generate_all, provenance, written
     from r3dpa.stages import BASELINE_STAGES, published_sampler, scene_generator
     from r3dpa.viz.scenes import draw_scenes
 

@@ -16,13 +16,13 @@ import r3dpa
 from lidarsim.scan_files import read_beside, read_clouds
 from r3dpa import viz
 from r3dpa.checkpoints import Checkpoint
-from r3dpa.cli.parser import SceneOptions
 from r3dpa.data.scans import find_scans
 from r3dpa.data.scene_writer import SceneWriter
 from r3dpa.generation import SceneGenerator
 from r3dpa.geometry import BeamProjection, ScanGeometry
 from r3dpa.io import source_commit
 from r3dpa.pretrained import without_features
+from r3dpa.scene_files.options import SceneOptions
 
 if TYPE_CHECKING:
     from r3dpa.baselines import BaselineGenerator

@@ -19,8 +19,6 @@ from lidarsim.clouds import PointCloud
 from lidarsim.scan_files import out_of_range, read_scan
 from r3dpa import viz
 from r3dpa.checkpoints import read_checkpoint
-from r3dpa.cli.parser import EditOptions
-from r3dpa.cli.scene_files import feature_source_of, provenance
 from r3dpa.data import PointSample, Scan, ScanError, pooled_grids
 from r3dpa.data.images import read_mask
 from r3dpa.data.labels import find_labels
@@ -34,6 +32,8 @@ from r3dpa.flow.solvers import evaluations
 from r3dpa.geometry import Pixels, in_range, project_pixels
 from r3dpa.io import atomic_path, json_values, usable_device, write_text
 from r3dpa.nn import VelocityNetwork
+from r3dpa.scene_files.generated import feature_source_of, provenance
+from r3dpa.scene_files.options import EditOptions
 from r3dpa.scenes import SceneBatch
 from r3dpa.stages import BASELINE_STAGES, scene_generator
 from r3dpa.viz.scenes import draw_scene
