@@ -86,9 +86,8 @@ class SceneVAE:
         given = self._checked_points(points)
         known = None if labels is None else torch.from_numpy(np.asarray(labels, dtype=np.int64))
         pixels = project_pixels(given, self.geometry.projection, known)
-        codec = self.geometry.codec
-        encoded = codec if self.vae.encode_further else codec.without_further()
-        image = encoded.to_image(*pixels).to(self.device)
+        codec = self.vae.codec_of_input(self.geometry.codec)
+        image = codec.to_image(*pixels).to(self.device)
         return self.vae.encode(image[None]).mean
 
     @torch.no_grad()

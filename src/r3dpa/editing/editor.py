@@ -365,8 +365,7 @@ class SceneEditor:
                 "them by their full scale, such as 255"
             )
         pixels = map_pixels(lambda values: values.to(self.generator.device), pixels)
-        encoded = codec if vae.encode_further else codec.without_further()
-        image = encoded.to_image(*pixels)
+        image = vae.codec_of_input(codec).to_image(*pixels)
         return self.generator.latent_norm.normalise(vae.encode(image).mean)
 
     def _result(

@@ -15,6 +15,7 @@ import torch.nn.functional as F
 from einops import rearrange
 from torch import Tensor, nn
 
+from r3dpa.geometry import RangeCodec
 from r3dpa.nn.layers import (
     AttentionBlock,
     CircularConv2d,
@@ -269,6 +270,10 @@ class VAE(Autoencoder):
     def image_channels(self) -> int:
         """Channels of the images that it encodes and decodes."""
         return self.in_channels + self.intensity + (self.num_classes > 0)
+
+    def codec_of_input(self, codec: RangeCodec) -> RangeCodec:
+        """Codec of what the encoder reads: without intensity and class where it sees none."""
+        return codec if self.encode_further else codec.without_further()
 
     def outputs_of(self, prediction: Tensor) -> PixelOutputs:
         """Parts of outputs ``(B, ..., H, W)`` of the decoder."""
