@@ -31,7 +31,7 @@ from scene_scores import images_of
 
 from r3dpa.cli.features import read_data
 from r3dpa.data.scans import evenly
-from r3dpa.viz import range_image_picture, save
+from r3dpa.viz import palette_image, range_image_picture
 
 BLOCK = 4, 8
 RANGE_M = 10.0
@@ -96,7 +96,8 @@ def main(arguments=None):
             results[name]["rows"] = [part.mean((0, 2)).tolist() for part in evidence]
             shown = trained.generated_m[:SHOWN]
             if options.picture is not None:
-                save(_figure(shown, evidence[1], data.projection.sensor), options.picture)
+                figure = _figure(shown, evidence[1], data.projection.sensor)
+                palette_image(figure).save(options.picture, optimize=True)
     report = {"scenes": len(scenes), "scans": len(scans), "parts": results}
     text = json.dumps(report, indent=1)
     sys.stdout.write(text + "\n")
