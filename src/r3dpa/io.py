@@ -140,14 +140,22 @@ def one_line(values: str | dict[str, Any]) -> str:
 
 
 def check_folder(out: Path | None) -> None:
-    """Refuse an output folder whose path is a file, before the work starts."""
+    """Refuse an output folder whose path is a file, before the work starts.
+
+    Raises:
+        ValueError: With the name of the file.
+    """
     for folder in () if out is None else (out, *out.parents):
         if folder.is_file():
             raise ValueError(f"{folder} is a file; give another --out")
 
 
 def check_file(out: Path | None) -> None:
-    """Refuse an output file whose path is a folder, before the work starts."""
+    """Refuse an output file whose path is a folder, before the work starts.
+
+    Raises:
+        ValueError: With the name of the folder, or of a file above it.
+    """
     if out is not None and out.is_dir():
         raise ValueError(f"{out} is a folder; give --out the name of a file")
     check_folder(None if out is None else out.parent)

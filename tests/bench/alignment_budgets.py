@@ -95,12 +95,12 @@ def compare(rows, base, seconds):
 
 def draw(results, metric, path):
     """Picture of a metric over the hours of each row."""
-    figure = Figure((5, 3.5), layout="constrained")
+    figure = Figure((5, 4), layout="constrained")
     axes = figure.add_subplot(xlabel="hours of a core", ylabel=metric)
     for name, by_steps in results.items():
         hours = [row["hours"] for row in by_steps.values()]
         axes.plot(hours, [row[metric]["mean"] for row in by_steps.values()], "o-", label=name)
-    axes.legend()
+    figure.legend(loc="outside upper center", ncols=2)
     figure.savefig(path, dpi=150)
 
 

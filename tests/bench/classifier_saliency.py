@@ -46,7 +46,7 @@ def returns_alone(range_m):
 def without_gaps(range_m):
     """Images whose missing returns take the range of the last return before them in the ring.
 
-    A ring without any return takes that of the first pixel, 0.
+    Ranges are at least 1 m, which is what a ring without any return gets.
     """
     columns = torch.arange(range_m.shape[-1])
     last = torch.where(range_m > 0, columns, -1).cummax(dim=-1).values
@@ -86,19 +86,16 @@ def main(arguments=None):
     data.setup("fit")
     scans = images_of(data, evenly(data.val_set.scans, options.num))
     scenes = torch.from_numpy(np.load(options.scenes / "range_m.npy")[: options.num])
-    results = {}
-    for name, part_of in PARTS.items():
-        trained = train_classifier(part_of(scans), part_of(scenes))
-        accuracy = accuracy_of(trained)
-        results[name] = {"accuracy": accuracy.value, "error": accuracy.standard_error}
-        if name == "whole":
-            evidence = [evidence_of(trained.network, images) for images in trained[1:]]
-            results[name]["rows"] = [part.mean((0, 2)).tolist() for part in evidence]
-            shown = trained.generated_m[:SHOWN]
-            if options.picture is not None:
-                figure = _figure(shown, evidence[1], data.projection.sensor)
-                palette_image(figure).save(options.picture, optimize=True)
-    report = {"scenes": len(scenes), "scans": len(scans), "parts": results}
+    trained = {name: train_classifier(of(scans), of(scenes)) for name, of in PARTS.items()}
+    results = {name: accuracy_of(each)._asdict() for name, each in trained.items()}
+    network, held_out, unseen = trained["whole"]
+    evidence = evidence_of(network, unseen)
+    of_scans = evidence_of(network, held_out)
+    rows = {"scans": of_scans.mean((0, 2)).tolist(), "scenes": evidence.mean((0, 2)).tolist()}
+    if options.picture is not None:
+        figure = _figure(unseen[:SHOWN], evidence, data.projection.sensor)
+        palette_image(figure).save(options.picture, optimize=True)
+    report = {"scenes": len(scenes), "scans": len(scans), "accuracy": results, "evidence": rows}
     text = json.dumps(report, indent=1)
     sys.stdout.write(text + "\n")
     if options.out is not None:

@@ -75,16 +75,16 @@ def inpaint(
         raise ValueError("--objects FILE needs --object NAME, a class of the file")
     if object is None and (strength, window, features_ckpt) != (None, None, None):
         raise ValueError("--strength, --window and --features_ckpt need --object")
+    shared = EditOptions(**options)
     if object is not None:
-        ckpt = EditOptions(**options).ckpt
-        check_features(ckpt)
-        arguments["objects"] = objects = objects or objects_file(ckpt)
+        check_features(shared.ckpt)
+        arguments["objects"] = objects = objects or objects_file(shared.ckpt)
     from r3dpa.editing import EditResult, most_like_first, regions
     from r3dpa.editing.objects import ObjectLibrary
     from r3dpa.scene_files.edits import EditSession
     from r3dpa.scene_files.generated import feature_source_of
 
-    session = EditSession(EditOptions(**options), num, strength, window)
+    session = EditSession(shared, num, strength, window)
     source = session.read(scan)
     if mask is not None:
         region = session.read_mask(mask)
@@ -155,11 +155,12 @@ def mix(
         "strength": strength,
         "window": window,
     }
-    check_features(EditOptions(**options).ckpt)
+    shared = EditOptions(**options)
+    check_features(shared.ckpt)
     from r3dpa.editing.regions import mask_of_tokens, sector_weights
     from r3dpa.scene_files.edits import EditSession
 
-    session = EditSession(EditOptions(**options), num, strength, window)
+    session = EditSession(shared, num, strength, window)
     paths = enumerate((left, right))
     scans = {f"{number}: {path.stem}": session.read(path) for number, path in paths}
     grids = session.feature_grids(scans.values(), features_ckpt)

@@ -105,7 +105,7 @@ def change_scans(
         write(out / _REQUEST, to_json(request))
         lines = _lines_that_stand(paths, root, out)
         todo = [path for name, path in paths.items() if name not in lines]
-        lines |= _change(job, todo, lines)
+        lines = _change(job, todo, lines)
         bad = [lines[name]["error"] for name in paths if "error" in lines[name]]
         has_results = len(bad) < len(lines)
         if not has_results:
@@ -137,18 +137,17 @@ def _lines_that_stand(paths: dict[str, Path], root: Path, out: Path) -> dict[str
 def _change(
     job: _FolderRun, todo: list[Path], done: dict[str, dict[str, Any]]
 ) -> dict[str, dict[str, Any]]:
-    """Change scans, each with a line in the journal at once; write the report of all."""
-    out = job.options.out
-    lines: dict[str, dict[str, Any]] = {}
+    """Change scans, each with a line in the journal at once; write and return the lines of all."""
+    out, lines = job.options.out, dict(done)
     journal, report = Journal(out / _LINES), Journal(out / _REPORT)
     journal.start(*journal.read())  # without an incomplete last line
-    with tqdm(total=len(todo), unit="scan", disable=None) as bar:
+    total = len(done) + len(todo)
+    with tqdm(total=total, initial=len(done), unit="scan", disable=None) as bar:
         for line in in_processes(job, todo, job.options.workers):
             lines[line["scan"]] = line
             journal.add(line)
             bar.update()
-    everything = done | lines
-    report.start(*(everything[name] for name in sorted(everything)))
+    report.start(*(lines[name] for name in sorted(lines)))
     journal.delete()
     delete_unfinished(out)  # at the end: workers of a killed run may outlive it
     return lines
