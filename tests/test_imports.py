@@ -52,7 +52,7 @@ ALLOWED = {
     "metrics": {"geometry", "nn", "features", "lidarsim", "feature_names"},
     "viz": METHOD | {"metrics"},
     "baselines": METHOD,
-    "scene_files": METHOD | {"viz", "stages"},
+    "scene_files": METHOD | {"viz", "stages", "feature_names"},
     "stages": {"flow", "checkpoints", "generation", "baselines"},
     "callbacks": METHOD | METRICS | {"viz"},
     "ablation": METHOD | METRICS | {"viz", "callbacks"},
@@ -181,7 +181,7 @@ print(seconds, *loaded & {{"torch", "r3dpa", "lightning", "yaml", "tqdm", "filel
 def test_sampling_loads_neither_lightning_nor_baselines():
     code = """
 import sys
-import r3dpa.cli.sample, r3dpa.scene_files.generated, r3dpa.stages, r3dpa.viz.scenes
+import r3dpa.scene_files.sample, r3dpa.scene_files.generated, r3dpa.stages, r3dpa.viz.scenes
 print(*{"lightning", "r3dpa.baselines", "r3dpa.modules"} & set(sys.modules))
 """
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -71,7 +71,7 @@ def test_classes_and_a_car_where_the_weights_have_them(tmp_path, monkeypatch):
         ordered.append(most_like_first(edits, *rest))
         return ordered[-1]
 
-    monkeypatch.setattr("r3dpa.editing.most_like_first", recorded)
+    monkeypatch.setattr("r3dpa.scene_files.shown_edits.most_like_first", recorded)
     path = labelled_checkpoint(tmp_path)
     checkpoint = replace(read_checkpoint(path), feature_source="geometric")
     save_checkpoint(checkpoint, path, overwrite=True)

@@ -17,7 +17,6 @@ from lidarsim.scan_files import read_npz, read_points, read_scan
 from r3dpa.checkpoints import convert
 from r3dpa.cli import main
 from r3dpa.cli.parser import parse
-from r3dpa.cli.sample import sample as sample_command
 from r3dpa.flow.solvers import ODE_SOLVERS
 from r3dpa.generation import SamplerConfig, SceneGenerator
 from r3dpa.geometry import (
@@ -27,6 +26,7 @@ from r3dpa.geometry import (
     points_of,
 )
 from r3dpa.io import source_commit
+from r3dpa.scene_files.sample import sample as sample_command
 from r3dpa.viz.scenes import COLOURS
 
 SENSOR = LidarSensor(beams=16, columns=64)  # of conf/smoke.yaml

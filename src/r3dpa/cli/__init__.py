@@ -41,8 +41,10 @@ COMMANDS = {
     "data weather": Command("weather:weather", "simulate weather on recorded scans", True),
     "data corrupt": Command("weather:corrupt", "add sensor faults to recorded scans", True),
     "data realism": Command("evaluate:realism", "compare simulated scans with real ones"),
-    "sample": Command("sample:sample", "generate scenes from a checkpoint", resumable=True),
-    "gallery": Command("sample:gallery", "write a page of scenes, nearest scans and edits"),
+    "sample": Command(
+        "r3dpa.scene_files.sample:sample", "generate scenes from a checkpoint", resumable=True
+    ),
+    "gallery": Command("gallery:gallery", "write a page of scenes, nearest scans and edits"),
     "edit inpaint": Command("edit:inpaint", "generate a part of a scan anew"),
     "edit mix": Command("edit:mix", "generate scenes that follow one scan on each side"),
     "edit complete": Command("edit:complete", "fill a missing sector or dropped beams"),

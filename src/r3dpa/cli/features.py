@@ -6,25 +6,18 @@
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Sequence
-from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, cast
 
 from lightning import Trainer
 
 from r3dpa.cli.presets import shipped
 from r3dpa.cli.stages import StageParser, ignore_harmless_notices
 from r3dpa.data.datamodules import LidarDataModule
-from r3dpa.data.datasets import CachedImages
-from r3dpa.data.feature_grids import features_lock, plan
 from r3dpa.data.range_images import SimulatedImageDataModule
-from r3dpa.data.scans import Scan
 from r3dpa.feature_names import SOURCES
 from r3dpa.features.scalr import feature_source
-from r3dpa.geometry import Projection
-from r3dpa.modules.feature_extraction import FeatureExtraction
+from r3dpa.modules.feature_extraction import extract_features
 from r3dpa.modules.stage import check_trainer
 
 
@@ -51,7 +44,7 @@ def features(args: list[str]) -> None:
             "the ranges of this data are cached without their scans: use data prepare, or a codec "
             "with channels of intensity or class"
         )
-    _extract(data, trainer, config.grid_sizes or [data.grid_size])
+    extract_features(data, trainer, config.grid_sizes or [data.grid_size])
 
 
 def prepare(args: list[str]) -> None:
@@ -72,51 +65,6 @@ def prepare(args: list[str]) -> None:
         "no feature grids" if data.features_dir is None else f"feature grids: {data.features_dir}"
     )
     sys.stdout.write(f"{len(train)} scans to train, {len(val)} held out; {grids}\n")
-
-
-def _extract(data: LidarDataModule, trainer: Trainer, sizes: list[tuple[int, int]]) -> None:
-    # The data module finds or simulates its scans; it must not extract grids itself.
-    extractor, data.extractor = cast(Any, data.extractor), None
-    folder = cast(Path, data.features_dir)
-    projection: Projection | None = None
-    scans: list[Scan] = []
-    images: CachedImages | None = None
-    with ExitStack() as job:
-        if trainer.is_global_zero:
-            # Before Lightning starts the other processes, which would wait and time out.
-            data.prepare_data()
-            data.setup("predict")
-            projection, images = data.geometry.projection, data.images
-            arguments = data.all_set.scans, extractor, projection, sizes, folder, trainer.precision
-            if plan(*arguments).missing:  # complete grids may lie on a read-only disk
-                job.enter_context(features_lock(folder))
-            todo = plan(*arguments)  # another job may have written some before the lock was free
-            scans = list(todo.missing)
-            stores = ", ".join(str(folder / f"{h}x{w}") for h, w in todo.stores)
-            sys.stdout.write(
-                f"feature grids of {extractor.name}: {len(scans)} scans to do, {todo.num_kept} "
-                f"done; {todo.num_bytes / 1e9:.3g} GB needed, in {stores}\n"
-            )
-            sys.stdout.flush()  # into a log file at once
-        loading = {"batch_size": data.batch_size, "num_workers": data.num_workers}
-        extraction = FeatureExtraction(
-            extractor, projection, sizes, folder, scans, images=images, **loading
-        )
-        started = time.monotonic()
-        try:
-            trainer.predict(extraction, return_predictions=False)
-        except SystemExit as stop:
-            if stop.code == 1:  # Lightning turns Ctrl-C into this
-                raise KeyboardInterrupt from None
-            raise
-        finally:
-            extraction.close()
-    if trainer.is_global_zero:
-        rate = len(scans) / (time.monotonic() - started)
-        sys.stdout.write(
-            f"feature grids: {len(scans)} made, {todo.num_kept} kept, {rate:.3g} scans per second, "
-            f"in {stores}\n"
-        )
 
 
 def read_data(source: Path, columns: Sequence[str] = ()) -> LidarDataModule:

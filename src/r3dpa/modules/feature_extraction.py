@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
+import sys
+import time
 from collections.abc import Sequence
+from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
 import torch
-from lightning.pytorch import LightningModule
+from lightning.pytorch import LightningModule, Trainer
 from torch.utils.data import DataLoader, DistributedSampler
 
+from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.data.datasets import CachedImages, PointDataset, PointSample
-from r3dpa.data.feature_grids import Extractor, GridSettings, pooled_grids
+from r3dpa.data.feature_grids import (
+    Extractor,
+    GridSettings,
+    features_lock,
+    plan,
+    pooled_grids,
+)
 from r3dpa.data.loaders import plain_loader
 from r3dpa.data.scans import Scan
 from r3dpa.data.store import StoreWriter
@@ -108,3 +119,71 @@ class FeatureExtraction(LightningModule):
         for writer in self._writers.values():
             writer.close()
         self._writers.clear()
+
+
+def extract_features(
+    data: LidarDataModule, trainer: Trainer, grid_sizes: list[tuple[int, int]]
+) -> None:
+    """Write the feature grids that a data module with an extractor lacks, and say how many.
+
+    A repeated call continues. The first process plans the work and locks the folder before
+    Lightning starts the others, which would wait and time out.
+
+    Raises:
+        KeyboardInterrupt: After Ctrl-C, which Lightning turns into a SystemExit.
+    """
+    # The data module finds or simulates its scans; it must not extract grids itself.
+    extractor, data.extractor = cast(Any, data.extractor), None
+    folder = cast(Path, data.features_dir)
+    projection: Projection | None = None
+    scans: list[Scan] = []
+    images: CachedImages | None = None
+    with ExitStack() as job:
+        if trainer.is_global_zero:
+            data.prepare_data()
+            data.setup("predict")
+            projection, images = data.geometry.projection, data.images
+            make_plan = partial(
+                plan,
+                data.all_set.scans,
+                extractor,
+                projection,
+                grid_sizes,
+                folder,
+                trainer.precision,
+            )
+            if make_plan().missing:  # complete grids may lie on a read-only disk
+                job.enter_context(features_lock(folder))
+            todo = make_plan()  # another job may have written some before the lock was free
+            scans = list(todo.missing)
+            stores = ", ".join(str(folder / f"{h}x{w}") for h, w in todo.stores)
+            sys.stdout.write(
+                f"feature grids of {extractor.name}: {len(scans)} scans to do, {todo.num_kept} "
+                f"done; {todo.num_bytes / 1e9:.3g} GB needed, in {stores}\n"
+            )
+            sys.stdout.flush()  # into a log file at once
+        extraction = FeatureExtraction(
+            extractor,
+            projection,
+            grid_sizes,
+            folder,
+            scans,
+            batch_size=data.batch_size,
+            num_workers=data.num_workers,
+            images=images,
+        )
+        started = time.monotonic()
+        try:
+            trainer.predict(extraction, return_predictions=False)
+        except SystemExit as stop:
+            if stop.code == 1:
+                raise KeyboardInterrupt from None
+            raise
+        finally:
+            extraction.close()
+    if trainer.is_global_zero:
+        rate = len(scans) / (time.monotonic() - started)
+        sys.stdout.write(
+            f"feature grids: {len(scans)} made, {todo.num_kept} kept, {rate:.3g} scans per second, "
+            f"in {stores}\n"
+        )
