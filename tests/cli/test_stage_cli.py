@@ -77,6 +77,16 @@ def test_one_batch_is_no_share_of_all(capsys):
     assert "\n  limit_train_batches: 1.0\n" in shown
 
 
+@pytest.mark.parametrize("word", ["null", "None"])
+def test_a_nested_value_is_unset_from_the_command_line(word, capsys):
+    """jsonargparse hands null on as the text None, which is no number."""
+    option = "--model.init_args.weights.adversarial_ratio"
+    with pytest.raises(SystemExit):
+        main(["fit", "joint", "--preset", "demo", option, word, "--print_config"])
+    config = yaml.safe_load(capsys.readouterr().out)
+    assert config["model"]["init_args"]["weights"]["adversarial_ratio"] is None
+
+
 def test_a_stage_of_range_images_needs_batches_of_them(smoke_args, tmp_path):
     more = ["--data", f"{BORING}.BoringDataModule", "--trainer.logger=false"]
     arguments = smoke_args("vae_alignment", tmp_path, *more)

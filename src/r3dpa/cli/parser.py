@@ -101,11 +101,15 @@ class Parser(ArgumentParser):
         return super().add_argument(*args, **kwargs)
 
     def parse_args(self, args: Any = None, *others: Any, **settings: Any) -> Any:
-        """Parse words, in which classes may have the import paths of earlier versions."""
+        """Parse words, in which classes may have the import paths of earlier versions.
+
+        ``None`` is read as ``null``: jsonargparse itself writes it so for the parser of a class.
+        """
         words = []
         for word in sys.argv[1:] if args is None else args:
             name, equals, value = word.rpartition("=")  # --option=class or class
-            words.append(f"{name}{equals}{current_path(value)}")
+            value = "null" if value == "None" else current_path(value)
+            words.append(f"{name}{equals}{value}")
         return super().parse_args(words, *others, **settings)
 
     def instantiate(self, *args: Any, **settings: Any) -> Any:
