@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from tqdm import tqdm
@@ -15,14 +15,16 @@ from tqdm import tqdm
 import r3dpa
 from lidarsim.scan_files import read_beside, read_clouds
 from r3dpa import viz
-from r3dpa.checkpoints import Checkpoint
+from r3dpa.checkpoints import Checkpoint, read_snapshot
 from r3dpa.data.scans import find_scans
 from r3dpa.data.scene_writer import SceneWriter
-from r3dpa.generation import SceneGenerator
+from r3dpa.flow.sampler import Quality
+from r3dpa.generation import Autoguidance, SamplerConfig, SceneGenerator
 from r3dpa.geometry import BeamProjection, ScanGeometry
 from r3dpa.io import source_commit
 from r3dpa.pretrained import without_features
 from r3dpa.scene_files.options import SceneOptions
+from r3dpa.stages import BASELINE_STAGES, published_sampler
 
 if TYPE_CHECKING:
     from r3dpa.baselines import BaselineGenerator
@@ -58,6 +60,38 @@ def provenance(
         "commit": source_commit(),
         "torch": torch.__version__,
     }
+
+
+def sampler_of(
+    checkpoint: Checkpoint, quality: Quality | None, given: Mapping[str, Any]
+) -> SamplerConfig | Quality | None:
+    """Sampler of a quality, or of a baseline as published, with the settings that are given."""
+    if not given:
+        return quality
+    if checkpoint.stage in BASELINE_STAGES:
+        return published_sampler(checkpoint).changed(**given)
+    return SamplerConfig.of_quality(quality or "good").changed(**given)
+
+
+def autoguidance_of(
+    path: Path,
+    checkpoint: Checkpoint,
+    weights: Literal["ema", "last"],
+    device: str,
+    scale: float,
+    interval: tuple[float, float],
+) -> tuple[Autoguidance, dict[str, Any]]:
+    """Guidance away from the model of a snapshot, and what the metadata says about it."""
+    weak = read_snapshot(path, checkpoint, weights)
+    sit, shift = weak.sit.to(device), weak.shift.to(device)
+    about = {
+        "checkpoint": str(path),
+        "checkpoint_written": written(path),
+        "step": weak.step,
+        "scale": scale,
+        "interval": list(interval),
+    }
+    return Autoguidance(sit, scale, interval, weak.scale, shift), about
 
 
 def generate_all(

@@ -3,17 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from jsonargparse.typing import PositiveInt
 
 from r3dpa.scene_files.options import ODESolver, SceneOptions
-
-if TYPE_CHECKING:
-    from r3dpa.checkpoints import Checkpoint
-    from r3dpa.flow.sampler import Quality
-    from r3dpa.generation import Autoguidance, SamplerConfig
-    from r3dpa.geometry import BeamProjection
 
 
 def sample(
@@ -73,7 +67,12 @@ def sample(
     from r3dpa.geometry import projection_for
     from r3dpa.io import usable_device
     from r3dpa.nn import ThinDecoder
-    from r3dpa.scene_files.generated import generate_all, provenance
+    from r3dpa.scene_files.generated import (
+        autoguidance_of,
+        generate_all,
+        provenance,
+        sampler_of,
+    )
     from r3dpa.stages import scene_generator
     from r3dpa.viz.scenes import draw_scenes
 
@@ -99,12 +98,12 @@ def sample(
     if autoguidance is not None:
         scale, guidance_scale = 2.0 if guidance_scale is None else guidance_scale, 1.0
         interval = guidance_interval or (0.0, 1.0)
-        guidance, about_guide = _autoguidance(
+        guidance, about_guide = autoguidance_of(
             autoguidance, checkpoint, files.weights, device, scale, interval
         )
     generator = scene_generator(
         checkpoint,
-        _sampler(checkpoint, quality, given),
+        sampler_of(checkpoint, quality, given),
         weights=files.weights,
         decoder=decoder,
         precision=precision,
@@ -139,49 +138,8 @@ def sample(
     if measured["drawn_by_last_run"]:
         line += f", {measured['seconds_per_scene']:.3g} s per scene"
     if seen_by is not None:
-        line += _view(str(sensor), seen_by)
+        view = seen_by.sensor
+        line += (
+            f", as seen by {sensor}: {view.beams} x {view.columns}, up to {view.range_max_m:g} m"
+        )
     return "\n".join(filter(None, (note, line, opened)))
-
-
-def _sampler(
-    checkpoint: Checkpoint, quality: Quality | None, given: dict[str, Any]
-) -> SamplerConfig | Quality | None:
-    """Sampler of a quality, or of a baseline as published, with the settings that were given."""
-    from r3dpa.generation import SamplerConfig
-    from r3dpa.stages import BASELINE_STAGES, published_sampler
-
-    if not given:
-        return quality
-    if checkpoint.stage in BASELINE_STAGES:
-        return published_sampler(checkpoint).changed(**given)
-    return SamplerConfig.of_quality(quality or "good").changed(**given)
-
-
-def _autoguidance(
-    path: Path,
-    checkpoint: Checkpoint,
-    weights: Literal["ema", "last"],
-    device: str,
-    scale: float,
-    interval: tuple[float, float],
-) -> tuple[Autoguidance, dict[str, Any]]:
-    """Guidance away from the model of a snapshot, and what the metadata says about it."""
-    from r3dpa.checkpoints import read_snapshot
-    from r3dpa.generation import Autoguidance
-    from r3dpa.scene_files.generated import written
-
-    weak = read_snapshot(path, checkpoint, weights)
-    sit, shift = weak.sit.to(device), weak.shift.to(device)
-    about = {
-        "checkpoint": str(path),
-        "checkpoint_written": written(path),
-        "step": weak.step,
-        "scale": scale,
-        "interval": list(interval),
-    }
-    return Autoguidance(sit, scale, interval, weak.scale, shift), about
-
-
-def _view(name: str, projection: BeamProjection) -> str:
-    sensor = projection.sensor
-    return f", as seen by {name}: {sensor.beams} x {sensor.columns}, up to {sensor.range_max_m:g} m"
