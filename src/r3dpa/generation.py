@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -163,6 +162,8 @@ class SceneGenerator:
             ValueError: If it cannot be read, or a network, the latent statistics or the scan
                 geometry is missing.
         """
+        _check_choice("weights", weights, ("ema", "last"))
+        _check_choice("decoder", decoder, ("full", "thin", None))
         checkpoint = open_checkpoint(checkpoint)
         if checkpoint.stage == "vae_alignment":
             raise ValueError(
@@ -245,20 +246,22 @@ class SceneGenerator:
         device = usable_device(str(device))
         for network in (self.vae, self.sit, self.latent_norm):
             network.to(device)
-        if self._weak is not None and self._autoguidance is not None:
+        if self._weak is not None:
             self._weak.sit.to(device)
-            shift = self._autoguidance.latent_shift.to(device)
-            self._autoguidance = replace(self._autoguidance, latent_shift=shift)
         self._use_channels_last_on_gpu()
         self._decode = self.vae.decode
         return self
 
     def with_sampler(self, sampler: SamplerConfig) -> SceneGenerator:
-        """The same networks, compiled where these are, with another solver; both may be used."""
+        """Return a generator of another solver that shares the networks and their compiled code.
+
+        Both generators stay usable.
+        """
         if not isinstance(sampler, SamplerConfig):
             raise ValueError(f"sampler must be a SamplerConfig, got {sampler!r}")
         _check_average(sampler, self.sit, self._autoguidance)
         other = copy.copy(self)
+        # Their schedules differ; evaluation stays bound to the originals, to share compiled code.
         other._strong, other._weak = copy.copy(self._strong), copy.copy(self._weak)
         other.sampler, other._prepared = sampler, None
         return other
@@ -280,7 +283,7 @@ class SceneGenerator:
         self._velocity = self._strong
         guide = self._autoguidance
         if guide is not None and self._weak is not None:
-            scale, shift = guide.latent_scale, guide.latent_shift
+            scale, shift = guide.latent_scale, guide.latent_shift.to(self.device)
             first, last = guide.interval
             guided = times[(times >= first) & (times <= last) & (guide.scale != 1)]
             weak_times = renormalised_times(guided.to(self.device), scale, shift, self.interpolant)
@@ -392,10 +395,15 @@ def geometry_of(checkpoint: Checkpoint) -> ScanGeometry:
     return ScanGeometry.from_dict(dict(checkpoint.geometry))
 
 
+def _check_choice(name: str, value: str | None, choices: tuple[str | None, ...]) -> None:
+    if value not in choices:
+        names = ", ".join(str(choice) for choice in choices)
+        raise ValueError(f"unknown {name} {value!r}; choose from {names}")
+
+
 def check_precision(precision: str) -> None:
     """Refuse a precision that no generator has."""
-    if precision not in ("fp32", "bf16"):
-        raise ValueError(f"unknown precision {precision!r}; choose from fp32, bf16")
+    _check_choice("precision", precision, ("fp32", "bf16"))
 
 
 def recorded_guidance(

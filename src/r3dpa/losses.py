@@ -47,25 +47,28 @@ def reconstruction_loss(
     Raises:
         ValueError: If ``kind`` is neither ``l1`` nor ``l2``.
     """
-    if kind == "l1":
-        return F.l1_loss(reconstruction.float(), image.float())
-    if kind == "l2":
-        return F.mse_loss(reconstruction.float(), image.float())
-    raise ValueError(f"reconstruction loss must be 'l1' or 'l2', got {kind!r}")
+    return pixel_error(reconstruction, image, kind).mean()
 
 
 def reconstruction_errors(
     reconstruction: Tensor, image: Tensor, kind: Literal["l1", "l2"] = "l1"
 ) -> Tensor:
     """:func:`reconstruction_loss` ``(B,)`` of each image."""
-    pairs = zip(reconstruction.split(1), image.split(1), strict=True)
-    return torch.stack([reconstruction_loss(*pair, kind) for pair in pairs])
+    return pixel_error(reconstruction, image, kind).flatten(1).mean(dim=1)
 
 
 def pixel_error(prediction: Tensor, image: Tensor, kind: Literal["l1", "l2"] = "l1") -> Tensor:
-    """Absolute (``l1``) or squared (``l2``) error of each pixel, float32."""
+    """Absolute (``l1``) or squared (``l2``) error of each pixel, float32.
+
+    Raises:
+        ValueError: If ``kind`` is neither ``l1`` nor ``l2``.
+    """
     error = prediction.float() - image.float()
-    return error.abs() if kind == "l1" else error.square()
+    if kind == "l1":
+        return error.abs()
+    if kind == "l2":
+        return error.square()
+    raise ValueError(f"reconstruction loss must be 'l1' or 'l2', got {kind!r}")
 
 
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
@@ -103,11 +106,11 @@ def generator_loss(fake_logits: Tensor) -> Tensor:
 
 
 def balanced_gradient(image: Tensor, ratio: float) -> Tensor:
-    """The image, for a further loss whose gradient is ``ratio`` times an L1 loss's.
+    """Return the image with a hook that scales the gradient of a further loss.
 
-    The gradient of each sample that flows back gets this length, whatever its own. Without, the
-    gradient of a fixed adversarial weight is hundredths of the reconstruction's, or swamps
-    it, depending on the discriminator.
+    The gradient of each sample is rescaled to ``ratio`` times the length of the gradient of an L1
+    loss. With a fixed adversarial weight it would be hundredths of the reconstruction gradient, or
+    swamp it, depending on the discriminator.
 
     Source: as the adaptive weight of Esser et al., "Taming transformers" (CVPR 2021), per sample
     and at the image, so that results do not depend on how a batch is split.

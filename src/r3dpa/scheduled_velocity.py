@@ -33,7 +33,7 @@ class Autoguidance:
 
 
 class ScheduledVelocity:
-    """A network as the velocity function of a solver, at times that are known before.
+    """A network as the velocity function of a solver, at times known in advance.
 
     All samples of a call have the same time. The k-th call after :meth:`restart` takes row k of
     the precomputed modulations, so that no value of a time is read back from a GPU.

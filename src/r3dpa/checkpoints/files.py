@@ -136,10 +136,10 @@ def save_checkpoint(checkpoint: Checkpoint, path: str | Path, *, overwrite: bool
     about = {"format": _FORMAT, "step": checkpoint.step, **checkpoint.facts}
     about |= {"version": __version__, "commit": source_commit()}
     about["left_out"] = dict(checkpoint.left_out)
-    with atomic_path(path) as weights_file, atomic_path(description) as description_file:
-        save_file(weights, weights_file)
-        about["sha256"] = sha256_of(weights_file)
-        description_file.write_text(yaml.safe_dump(about, sort_keys=False))
+    with atomic_path(path) as weights_path, atomic_path(description) as description_path:
+        save_file(weights, weights_path)
+        about["sha256"] = sha256_of(weights_path)
+        description_path.write_text(yaml.safe_dump(about, sort_keys=False))
     return path
 
 

@@ -401,7 +401,8 @@ def _args_of(checkpoint: Checkpoint) -> dict[str, Any]:
     if state is not None:
         sit = state.arguments
         args["num_classes"] = sit["num_classes"]
-        args["bn_momentum"] = checkpoint.network("latent_norm").arguments["momentum"]
+        norm = checkpoint.networks.get("latent_norm") or checkpoint.network("ema_latent_norm")
+        args["bn_momentum"] = norm.arguments["momentum"]
         if state.kind is UNet:
             model = _UNET_NAMES.get(sit["channels"])
         else:

@@ -40,10 +40,10 @@ def transfer_rgb(
 
     ``sit`` and ``latent_norm`` are changed in place. Some groups keep their initial values
     ("fresh"): patch embedding and output layer if the number of latent channels or the patch size
-    differs; latent statistics if the number of latent channels differs; the position table if the
-    token grid differs; the projector without ``keep_projector``, or if it does not fit. A label
-    table is cut to its first row if this run has one. All other weights must fit. Returns a row
-    for each group of weights.
+    differs; latent statistics if the number of latent channels differs; the projector without
+    ``keep_projector``, or if it does not fit. The position table is computed anew ("resized") if
+    the token grid differs. A label table is cut to its first row if this run has one. All other
+    weights must fit. Returns a row for each group of weights.
 
     Source: tuning stages of valeoai/R3DPA, which keep the position table of another latent size if
     it has as many tokens.

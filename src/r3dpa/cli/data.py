@@ -26,8 +26,8 @@ def check(folder: Path, *, columns: tuple[str, ...] = ()) -> None:
 
     Args:
         folder: Root in the KITTI-360 layout, or a folder of scans of any format that can be read.
-        columns: Columns of files without names, such as ``x,y,z,intensity,ring``; default: by the
-            values.
+        columns: Columns of files without names, such as ``x,y,z,intensity,ring``; default:
+            inferred from the values.
     """
     from lidarsim.cloud_formats import READABLE
     from lidarsim.clouds import files_below, find_files, read_cloud, suffix_of
@@ -80,8 +80,8 @@ def view(
         source: A scan of any format that can be read, a folder of scans, or a ``.npz`` of scans.
         out: Folder for the pictures and the page; default: ``view/<name of the source>``.
         num: Maximum number of scans, evenly spaced over the folder.
-        columns: Columns of files without names, such as ``x,y,z,intensity,ring``; default: by the
-            values.
+        columns: Columns of files without names, such as ``x,y,z,intensity,ring``; default:
+            inferred from the values.
     """
     from r3dpa import viz
     from r3dpa.data.scans import evenly
@@ -125,8 +125,8 @@ def objects(
             where ``r3dpa edit inpaint --object`` finds it.
         features_ckpt: Weights of the feature source, if it has none of its own.
         limit: Maximum number of scans, evenly spaced.
-        columns: Columns of files without names, such as ``x,y,z,intensity,ring``; default: by the
-            values.
+        columns: Columns of files without names, such as ``x,y,z,intensity,ring``; default:
+            inferred from the values.
         device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
     """
     check_file(out)

@@ -193,9 +193,9 @@ def complete(
     and of the nearest beam are compared. The completion aims at a small error: large parts are made
     up by ``r3dpa edit inpaint``.
 
-    Azimuth 0 looks forward and grows to the left; 180 is behind. R2DM and R2Flow complete by
-    RePaint, LiDM its latents, all in ``--steps`` intervals from noise; they read no other option
-    of the solver, R3DPA reads none. ``--formats`` is not read.
+    Azimuth 0 looks forward and grows to the left; 180 is behind. R2DM and R2Flow run RePaint on
+    images, LiDM on latents, in ``--steps`` intervals; they ignore other solver options, and R3DPA
+    ignores all. ``--formats`` is ignored.
 
     Args:
         scan: Scan or folder of scans to complete: .bin, .pcd.bin, .pcd, .ply, .npy, .npz.

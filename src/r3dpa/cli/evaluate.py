@@ -40,8 +40,8 @@ def reference(
         ckpt: Weights by space, such as ``--ckpt.frid model.ckpt``.
         split: Part of the data.
         limit: Maximum scans, evenly spaced.
-        columns: Columns of files without names, such as ``x,y,z,intensity,ring``; default: by the
-            values.
+        columns: Columns of files without names, such as ``x,y,z,intensity,ring``; default:
+            inferred from the values.
         protocol: ``published`` prepares scans as the published numbers do: points on the corners
             of pixels, and pictures of LIP-Loc that wrap around.
         device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
@@ -58,7 +58,8 @@ def reference(
         raise ValueError(f"{out} exists: delete it, or give another --out")
     module = read_data(data, columns)
     train, val = module.limited_split()
-    scans = evenly({"train": train, "val": val, "all": sorted(train + val)}[split], limit)
+    splits = {"train": train, "val": val, "all": train + val}
+    scans = evenly(sorted(set(splits[split])), limit)  # a scan may be repeated in training
     if len(scans) < 2:
         given = "1 scan" if len(scans) == 1 else "no scans"
         raise ValueError(f"{data}: {given} in split {split}; at least 2 are needed")
@@ -183,8 +184,8 @@ def realism(
     Args:
         scans: Folder of ``.bin`` scans (A); one drive per folder.
         reference: Folder of real scans (B); a single drive gives no floor.
-        columns: Columns of files without names, such as ``x,y,z,intensity,ring``; default: by the
-            values.
+        columns: Columns of files without names, such as ``x,y,z,intensity,ring``; default:
+            inferred from the values.
         out: JSON file for the table.
     """
     from tqdm import tqdm

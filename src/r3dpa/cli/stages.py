@@ -264,7 +264,7 @@ class StageCLI(LightningCLI):
             super()._run_subcommand(subcommand)
 
     def before_fit(self) -> None:
-        """Load the stage before: what does not fit is said before hours of data preparation."""
+        """Load the stage before: mismatches are reported before hours of data preparation."""
         if isinstance(self.model, GenerativeModule) and self._ckpt_path is None:
             self.model.load_previous_stage()
             option, consequence = _WITHOUT_WEIGHTS.get(self.model.stage, ("", ""))

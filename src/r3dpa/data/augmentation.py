@@ -101,7 +101,8 @@ class Augmentation:
             ValueError: Naming the option and the property that the features lack.
         """
         problems = {}
-        if self.rotate and (getattr(extractor, "num_headings", 0) or 1) % grid_columns:
+        headings = getattr(extractor, "num_headings", None) or 1
+        if self.rotate and headings % grid_columns != 0:
             problems["rotate"] = f"rotate with the scan by a {grid_columns}th of a turn"
         if self.flip and not getattr(extractor, "mirror_invariant", False):
             problems["flip"] = "stay the same when the scan is mirrored"

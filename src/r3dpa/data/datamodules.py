@@ -84,11 +84,11 @@ class LidarDataModule(LoaderModule):
             look alike: hold out whole recordings by ``val_drives`` for an honest score.
         val_drives: Folders, relative to the root, that are held out whole; replaces ``val_every``.
         further_scans: Scans to train on beside ``scans``, such as simulated ones; none of
-            them is held out. Folder, file or glob.
+            them is held out. Folder, file or glob; their columns are detected.
         repeats: How often a training scan of ``scans`` occurs per epoch beside ``further_scans``.
         limit: Maximum scans per split, evenly spaced.
-        columns: Columns of files without names, such as ``x,y,z,intensity,time``; by default as the
-            values show.
+        columns: Columns of files without names, such as ``x,y,z,intensity,time``; default: inferred
+            from the values.
         prepare_data_per_node: Whether one process of each node prepares the data, as node-local
             disks need; by default one process of all does, for a disk that the nodes share.
         augmentation: Rotation and mirroring of training scans; none by default.
@@ -237,7 +237,8 @@ class LidarDataModule(LoaderModule):
         predicting = self.trainer is not None and self.trainer.predicting
         if predicting or self.features_dir is None or self.extractor is None:
             return
-        train, val, projection = self._scans_and_projection()
+        train, val = self.limited_split()
+        projection = self._fitted_projection()
         extractor = cast(Extractor, self.extractor.eval())
         num_made = write_feature_grids(
             train + val,
@@ -254,8 +255,9 @@ class LidarDataModule(LoaderModule):
 
         Before training, the share of the points that the images hold is printed.
         """
-        train, val, self.projection = self._scans_and_projection()
-        scans, grids = sorted(train + val), None
+        train, val = self.limited_split()
+        self.projection = self._fitted_projection()
+        scans, grids = sorted({*train, *val}), None  # a scan may be repeated in training
         if stage == "fit" and scans and not self.makes_scans:
             # Held-out scans are none of further_scans.
             checked = evenly(val or train, _SCANS_TO_CHECK)
@@ -325,14 +327,14 @@ class LidarDataModule(LoaderModule):
             return Path(cast(str, self.scans)) / "feature_grids" / name
         return default_features_dir(self.scans, name)
 
-    def _scans_and_projection(self) -> tuple[list[Scan], list[Scan], Projection]:
+    def _fitted_projection(self) -> Projection:
+        """Projection of the images; that of rings is fitted to the first training scans."""
+        if self.projection_kind != "rings":
+            return self._known_projection
         train, val = self.split()
-        projection = self._known_projection
-        if self.projection_kind == "rings":
-            first = (train or val)[:_SCANS_TO_FIT]
-            points = (torch.from_numpy(scan.read(self.sensor)[:, :3]) for scan in first)
-            projection = RingProjection.fit(points, self.sensor)
-        return evenly(train, self.limit), evenly(val, self.limit), projection
+        first = (train or val)[:_SCANS_TO_FIT]
+        points = (torch.from_numpy(scan.read(self.sensor)[:, :3]) for scan in first)
+        return RingProjection.fit(points, self.sensor)
 
 
 class KITTI360DataModule(LidarDataModule):
@@ -347,7 +349,15 @@ class KITTI360DataModule(LidarDataModule):
 
     def __init__(self, root: str, **kwargs: Any) -> None:
         # Given here, they are no options of the YAML: split and columns are fixed.
-        super().__init__(scans=root, val_every=None, val_drives=None, columns=None, **kwargs)
+        super().__init__(
+            scans=root,
+            val_every=None,
+            val_drives=None,
+            columns=None,
+            further_scans=None,
+            repeats=1,
+            **kwargs,
+        )
         self.root = root
 
     @property
@@ -388,7 +398,15 @@ class SimulatedDataModule(LidarDataModule):
         weather: Conditions | None = None,
         **kwargs: Any,
     ) -> None:
-        super().__init__(scans=root, val_every=None, val_drives=None, columns=None, **kwargs)
+        super().__init__(
+            scans=root,
+            val_every=None,
+            val_drives=None,
+            columns=None,
+            further_scans=None,
+            repeats=1,
+            **kwargs,
+        )
         at_least(2, num_scans=num_scans)  # one of them is held out
         self.root, self.num_scans, self.simulation_seed = root, num_scans, simulation_seed
         self.simulation_sensor, self.effects, self.weather = simulation_sensor, effects, weather

@@ -166,10 +166,14 @@ def any_settings(features_dir: str | Path) -> GridSettings:
     """
     stored = stored_settings(features_dir)
     if not stored:
-        raise StoreError(
-            f"no feature grids in {features_dir}: make them {REMEDY}, or give an extractor"
-        )
+        raise _no_grids(features_dir)
     return next(iter(stored.values()))
+
+
+def _no_grids(features_dir: str | Path) -> StoreError:
+    return StoreError(
+        f"no feature grids in {features_dir}: make them {REMEDY}, or give an extractor"
+    )
 
 
 class FeatureGrids(CachedTensors[Scan]):
@@ -189,10 +193,12 @@ class FeatureGrids(CachedTensors[Scan]):
         extractor: Extractor | None = None,
     ) -> None:
         stored, size = stored_settings(features_dir), (grid_size[0], grid_size[1])
-        if stored and size not in stored:
+        if not stored:
+            raise _no_grids(features_dir)
+        if size not in stored:
             sizes = ", ".join(str(list(other)) for other in stored)
             raise _made_otherwise("grid_size", sizes, list(size), Path(features_dir))
-        settings = stored[size] if stored else any_settings(features_dir)
+        settings = stored[size]
         settings.compare(_wanted(projection, extractor), Path(features_dir))
         super().__init__(settings.store(features_dir), scans)
         self.dim = settings.dim

@@ -299,7 +299,7 @@ class CachedTensors(Generic[Item]):
         more = f" and {len(items) - 1} more" if len(items) > 1 else ""
         return StoreError(
             f"no {self.store.what} of {items[0].path}{more} in {self.store.folder}, or the file "
-            "was replaced, or copied without its time of change, since: make what is missing "
+            "was replaced or copied without its modification time; make the missing ones "
             f"{self.store.remedy}"
         )
 

@@ -101,7 +101,7 @@ def interpolate_gaps(range_m: Tensor, missing: Tensor, how: Interpolation = "inv
 
 
 def blend_completion(generated_m: Tensor, range_m: Tensor, missing: Tensor) -> Tensor:
-    """Fill missing pixels with what interpolation and a generated image are each better at.
+    """Fill missing pixels by interpolation on surfaces and by a generated image at edges.
 
     The generated image says where returns are. Their range is interpolated (``inverse``) where the
     two known neighbours lie on one surface. At edges and in front of holes it is the mean of the

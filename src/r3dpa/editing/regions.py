@@ -93,7 +93,7 @@ def box3d(
     centre = axes @ torch.tensor(centre_m, dtype=torch.float64)
     half = torch.tensor(size_m, dtype=torch.float64) / 2
     if (centre.abs() <= half).all():
-        raise ValueError(f"{what} holds the sensor, so that every ray meets it: move it away")
+        raise ValueError(f"{what} contains the sensor, so every ray hits it; move the box away")
     directions = ray_directions(projection, dtype=torch.float64) @ axes.T
     # A ray in the plane of a face gives 0 / 0: it touches the slab everywhere.
     low = ((centre - half) / directions).nan_to_num(-math.inf, math.inf, -math.inf)

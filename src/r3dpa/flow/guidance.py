@@ -91,13 +91,13 @@ class FeatureGuidance:
         v + scale g                     as published
         v + scale |v| sqrt(q) g / |g|   relative
 
-    q is the share of the tokens that are selected, so that the term is to the velocity of these
-    tokens what ``scale`` says. No term is longer than ``max_ratio |v| sqrt(q)``: neither the steep
-    gradients of tokens near pure noise nor few tokens that get all of the term can carry the state
-    away. Samples do not influence each other. Where nothing is guided (a scale of 0, no token
-    selected, times outside the interval) the velocity equals ``velocity`` bit for bit, and no
-    gradient is computed unless another sample needs one. A sample whose gradient is not finite
-    goes unguided for that evaluation and is counted.
+    q is the share of the tokens that are selected, so that the term has ``scale`` times the
+    length of the velocity of these tokens. No term is longer than ``max_ratio |v| sqrt(q)``:
+    neither the steep gradients of tokens near pure noise nor few tokens that get all of the term
+    can carry the state away. Samples do not influence each other. Where nothing is guided (a scale
+    of 0, no token selected, times outside the interval) the velocity equals ``velocity`` bit for
+    bit, and no gradient is computed unless another sample needs one. A sample whose gradient is not
+    finite goes unguided for that evaluation and is counted.
 
     It is used as any velocity function, by every solver. ``legacy`` differs in these calls, which
     serve both::

@@ -20,6 +20,7 @@ from r3dpa.flow.times import ode_times, sde_times
 OdeSolverName = Literal["euler", "heun", "midpoint", "ab2", "ab3", "dpmpp_2m", "unipc"]
 Solver = Literal[OdeSolverName, "euler_maruyama", "ddpm", "ddim", "average_velocity"]
 Quality = Literal["instant", "draft", "good", "best"]
+SDELast = Literal["denoise", "mean"]
 _READS: dict[str, tuple[str, ...]] = {
     "euler_maruyama": ("eta", "sde_last", "sde_last_time"),
     "ddpm": ("shift", "eta"),
@@ -53,7 +54,7 @@ class SamplerConfig:
     solver: Solver = "euler_maruyama"
     steps: int = 256
     sde_last_time: float = 0.04
-    sde_last: Literal["denoise", "mean"] = "denoise"
+    sde_last: SDELast = "denoise"
     shift: float = 1.0
     eta: float = 1.0
 
@@ -67,6 +68,12 @@ class SamplerConfig:
                 "a sampler needs steps >= 1, shift > 0 and eta >= 0, got "
                 f"{self.steps}, {self.shift} and {self.eta}"
             )
+        if self.sde_last not in get_args(SDELast):
+            raise ValueError(
+                f"sde_last must be one of {', '.join(get_args(SDELast))}, got {self.sde_last!r}"
+            )
+        if not 0 < self.sde_last_time < 1:
+            raise ValueError(f"sde_last_time must lie in (0, 1), got {self.sde_last_time}")
         if self.solver == "ddpm" and self.eta > 1:
             raise ValueError(f"eta of ancestral steps must lie in [0, 1], got {self.eta}")
         averages = self.solver == "average_velocity"

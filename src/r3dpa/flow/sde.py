@@ -66,13 +66,13 @@ def euler_maruyama(
     if last == "denoise" and then != 0:
         raise ValueError(f"last='denoise' ends at t = 0, but the last time is {then}")
 
-    def drift_of(slope: Tensor, time: Tensor) -> Tensor:
+    def drift_of(slope: Tensor, x: Tensor, time: Tensor) -> Tensor:
         return (1 - eta) * slope + eta * interpolant.sde_drift(slope, x, time)
 
     draws = _draws(noise, x, len(steps))
     for step_now, step_then in steps:
         time = batch_time(step_now, x)
-        drift = drift_of(velocity(x, time), time)
+        drift = drift_of(velocity(x, time), x, time)
         if change_drift is not None:
             drift = change_drift(drift, x, time)
         step = step_then - step_now
@@ -82,7 +82,7 @@ def euler_maruyama(
     final_velocity = velocity(x, time)
     if last == "denoise":
         return interpolant.denoise(final_velocity, x, time).to(x.dtype)
-    return x + (then - now) * drift_of(final_velocity, time).to(x.dtype)
+    return x + (then - now) * drift_of(final_velocity, x, time).to(x.dtype)
 
 
 @torch.no_grad()

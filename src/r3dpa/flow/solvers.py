@@ -61,9 +61,9 @@ def heun(
 ) -> Tensor:
     """Heun steps; order 2, two evaluations per step but the last.
 
-    The last step is an Euler step, as in EDM (Karras et al. 2022, alg. 1) and R3DPA: one local
-    error of order 2 leaves the order as it is. ``corrector_velocity`` gives the second slope, if
-    another function is to.
+    The last step is an Euler step, as in EDM (Karras et al. 2022, alg. 1) and R3DPA: a single
+    local error of order 2 does not lower the order. ``corrector_velocity`` gives the second slope;
+    default: ``velocity``.
     """
     corrector_velocity = corrector_velocity or velocity
     *steps, (now, then) = step_pairs(times)

@@ -155,7 +155,10 @@ def measure(
     for batch, features in batches_with_features(islice(usable, protocol.num_samples), spaces):
         update_with(collection, batch, features, real=False)
         names += [scene.name for scene in batch]
-    has_more = next(stream, None) is not None
+    try:
+        has_more = next(stream, None) is not None
+    except ValueError:  # a bad scene beyond the samples, which does not count
+        has_more = True
     check_counts(len(names), reference, spaces, allow_few, bad)
 
     reference.fill(collection, spaces)

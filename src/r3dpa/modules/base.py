@@ -196,7 +196,7 @@ class GenerativeModule(Stage):
     def load_previous_stage(self) -> None:
         """Load ``rgb_weights`` and ``init_from``, and restart the EMA from the loaded weights.
 
-        A fit does it by itself; called earlier, it says early what does not fit.
+        A fit calls it; call it earlier to report mismatches early.
         """
         if self.rgb_weights is not None:
             if not isinstance(self.sit, SiT):
@@ -319,8 +319,8 @@ class GenerativeModule(Stage):
 
             (1 - s) * latents + s * noise        s = latent_noise * uniform
 
-        The noise has the mean and spread of the latents. Those that a flow draws are never without
-        an error, which a decoder of clean ones enlarges.
+        The noise has the mean and spread of the latents. Latents
+        drawn by a flow always carry an error, which a decoder trained on clean latents amplifies.
 
         Source: l-DeTok (Yang et al., "Latent denoising makes good tokenizers", ICLR 2026).
         """
@@ -390,7 +390,10 @@ class GenerativeModule(Stage):
             values["class_accuracy"] = right, (image[:, -1:] >= 0).flatten(1).sum(dim=1)
         self.held_out.update(
             batch["index"],
-            range_error_m=((error_m * mask).flatten(1).sum(dim=1), mask.flatten(1).sum(dim=1)),
+            range_error_m=(
+                torch.where(mask, error_m, 0.0).flatten(1).sum(dim=1),  # may be infinite elsewhere
+                mask.flatten(1).sum(dim=1),
+            ),
             **values,
             **self.held_out_errors(reconstruction, posterior.mean, draws),
         )
@@ -450,12 +453,12 @@ def _table(rows: Sequence[TransferRow]) -> str:
 
 def check_image(vae: VAE, codec: RangeCodec) -> None:
     """Refuse a VAE of other images than a codec encodes."""
-    of_vae = f"channels {vae.image_channels}, intensity {vae.intensity}, "
-    of_vae += f"num_classes {vae.num_classes}"
-    of_codec = f"channels {codec.channels}, intensity {codec.intensity_channel}, "
-    of_codec += f"num_classes {codec.num_classes}"
+    of_vae = (vae.image_channels, vae.intensity, vae.num_classes)
+    of_codec = (codec.channels, codec.intensity_channel, codec.num_classes)
     if of_vae != of_codec:
+        text = "channels {}, intensity {}, num_classes {}"
         raise ValueError(
-            f"the VAE is for images with {of_vae}, but --data.init_args.codec gives {of_codec}: "
+            f"the VAE is for images with {text.format(*of_vae)}, but --data.init_args.codec gives "
+            f"{text.format(*of_codec)}: "
             "set in_channels, intensity and num_classes of --model.init_args.vae to the latter"
         )

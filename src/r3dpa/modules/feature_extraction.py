@@ -32,8 +32,8 @@ from r3dpa.geometry import Projection
 class FeatureExtraction(LightningModule):
     """Writes the feature grids of scans, as ``trainer.predict`` runs it without further data.
 
-    Each process gets its share of the scans and appends to a shard of its own, so that what is made
-    survives whatever ends the run. Nothing is returned.
+    Each process gets its share of the scans and appends to a shard of its own, so that finished
+    grids survive any interruption. Nothing is returned.
 
     Args:
         extractor: Frozen network, see :class:`r3dpa.data.Extractor`; its ``prepare`` runs in the

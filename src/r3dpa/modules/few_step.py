@@ -246,7 +246,7 @@ class FewStep(FlowMatching):
         return errors
 
     def _decoder_losses(self, latents: Tensor) -> dict[str, Tensor]:
-        """Errors of a part of the global batch, of which this process may have nothing."""
+        """Losses of the thin decoder on a quarter of the global batch, perhaps none of it here."""
         if self.thin_decoder is None:
             return {}
         world = num_processes()

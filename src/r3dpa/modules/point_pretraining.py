@@ -97,7 +97,7 @@ class PointPretraining(LightningModule):
             self.edges.copy_(torch.from_numpy(np.quantile(values, levels, axis=0).T))
 
     def tokens(self, batch: PointCloudBatch, hidden: Tensor) -> Tensor:
-        """Standardised tokens ``(N, F)`` of all points, of which those hidden are not seen."""
+        """Standardised tokens ``(N, F)`` of all points, without looking at the hidden ones."""
         visible = ~hidden
         index = torch.nonzero(visible)[:, 0]
         place = visible.cumsum(0) - 1
@@ -118,7 +118,7 @@ class PointPretraining(LightningModule):
         return self.tokens(batch, torch.cat([masked.hidden for masked in scans]).to(self.device))
 
     def geometry_losses(self, tokens: Tensor, scans: Sequence[MaskedScan]) -> dict[str, Tensor]:
-        """The same from their tokens ``(N, F)``."""
+        """Losses of the masked geometry from tokens ``(N, F)``."""
         hidden = torch.cat([masked.hidden for masked in scans]).to(self.device)
         targets = torch.cat([masked.targets for masked in scans]).to(self.device)
         bins = torch.searchsorted(self.edges, targets.T.contiguous()).T

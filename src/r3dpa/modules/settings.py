@@ -14,7 +14,8 @@ TimeSampling = Literal["uniform", "lognormal", "u_shaped"]
 class LossWeights:
     """Weights of the training losses.
 
-    A loss of weight 0 is not computed, nor an adversarial one before its start.
+    A loss of weight 0 does not train, nor does an adversarial one before its start. ``returns``,
+    ``intensity`` and ``classes`` count only if ``reconstruction`` is not 0.
 
     Args:
         reconstruction: Weight of the reconstruction error: of all pixels, or, where images have a
@@ -39,8 +40,8 @@ class LossWeights:
             keeps the spatial structure (iREPA). Edits guide by features as they are, not centred.
         alignment_stop: First step without ``sit_alignment``, which helps early and may hold back
             later (HASTE); None: never.
-        alignment_release: Or end ``sit_alignment`` once its residual has stopped falling: when a
-            fast average is less than this share below a slow one (RARE); None: never.
+        alignment_release: End ``sit_alignment`` once the fast average of its residual is less than
+            this share below the slow one (RARE); None for never.
         alignment_decays: Decays of the two averages. The slow one should reach over a twelfth of
             all steps, the fast one over enough to even out the noise of batches.
 
@@ -110,9 +111,18 @@ class OptimizerConfig:
         return {name: values[name] for name in ("lr", "betas", "weight_decay", "eps")}
 
     def rate(self, step: int, max_steps: int) -> float:
-        """Learning rate of the step after ``step`` optimiser steps, out of ``max_steps``."""
-        rising = (step + 1) / max(1, self.warmup_steps + 1)
-        falling = (max_steps - step) / max(1, self.decay_steps) if self.decay_steps else 1.0
+        """Learning rate of the step after ``step`` optimiser steps, out of ``max_steps``.
+
+        Raises:
+            ValueError: If the rate falls, but ``max_steps`` is not set.
+        """
+        if max_steps < 1 and (self.decay_steps or self.cosine):
+            raise ValueError(
+                "optimizer.decay_steps and optimizer.cosine need the last step: set "
+                "--trainer.max_steps, or leave both out"
+            )
+        rising = (step + 1) / (self.warmup_steps + 1)
+        falling = (max_steps - step) / self.decay_steps if self.decay_steps else 1.0
         if self.cosine:
             done = (step - self.warmup_steps) / max(1, max_steps - self.warmup_steps)
             falling = (1 + math.cos(math.pi * min(1.0, max(0.0, done)))) / 2

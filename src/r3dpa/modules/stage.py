@@ -362,7 +362,7 @@ class Stage(L.LightningModule, ABC):
         if facts.get("stage") != self.stage:
             raise ValueError(
                 f"the checkpoint is of stage {facts.get('stage')!r}, this is {self.stage!r}; to "
-                "start a stage from another one, give model.init_from instead of ckpt_path"
+                "start a stage from another one, give --model.init_args.init_from, not --ckpt_path"
             )
         self.residuals = ResidualAverages(**checkpoint.get("alignment_residuals", {}))
         for state in checkpoint.get("optimizer_states", []):

@@ -35,8 +35,8 @@ from r3dpa.nn.pixel_outputs import (
 )
 
 Size = tuple[int, int]
-# AdamW moves a weight by at most its rate a step: without, logits need hundreds of steps to say
-# even how frequent the classes are.
+# AdamW moves a weight by at most the learning rate per step: without this gain, logits need
+# hundreds of steps to learn even the class frequencies.
 _LOGIT_GAIN = 8.0
 LevelSizes = tuple[int, int, bool, Size | None]  # input, output, attention, stride
 
@@ -171,8 +171,8 @@ class VAE(Autoencoder):
 
     ``intensity`` and ``num_classes`` add channels to such images: the encoder takes the class as
     one channel for each, the decoder predicts their logits. They enter and leave through layers of
-    their own, whose kernels are 1 x 1 to save time. The one of the encoder starts at 0: with the
-    other weights of a VAE without these channels, this one has its latents. Without
+    their own, whose kernels are 1 x 1 to save time. The encoder layer starts at 0, so that weights
+    of a VAE without these channels give the same latents. Without
     ``encode_further`` there is none, and the latents, which tell of range and return alone, are
     decoded to intensity and class as well.
 
@@ -298,9 +298,8 @@ class VAE(Autoencoder):
     def image_of(self, prediction: Tensor) -> Tensor:
         """Images ``(B, image_channels, H, W)``, with the likeliest class.
 
-        Of two modes, the one of the higher density. A choice for each pixel alone still leaves some
-        that fly, which are moved to a surface, and ripples, which are smoothed; intensity and class
-        stay.
+        Of two modes, the one of the higher density. Choosing per pixel leaves flying pixels,
+        which are moved to a surface, and ripples, which are smoothed; intensity and class stay.
         """
         outputs, image = self.outputs_of(prediction), prediction[:, : self.in_channels]
         if self.modes == 2:

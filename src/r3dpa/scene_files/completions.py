@@ -19,7 +19,7 @@ from lidarsim.changed_scans import write_below
 from lidarsim.clouds import PointCloud, find_files, read_cloud
 from r3dpa.data.scene_writer import SceneWriter
 from r3dpa.editing import EditResult
-from r3dpa.editing.gaps import interpolate_gaps, range_error_m, unseen_pixels
+from r3dpa.editing.gaps import in_view, interpolate_gaps, range_error_m, unseen_pixels
 from r3dpa.editing.regions import check_mask, dropped_beams, sector, sensor_pair
 from r3dpa.geometry import Pixels, Projection, SphericalProjection, points_of, values_at_returns
 from r3dpa.io import in_processes
@@ -232,7 +232,12 @@ def _completed_cloud(
 
 
 def _occupied(points: Tensor, projection: Projection) -> Tensor:
-    """Pixels ``(H, W)`` bool with a point of the scan, beyond the range limits too."""
+    """Pixels ``(H, W)`` bool with a point of the scan, beyond the range limits too.
+
+    Points above or below the field of view occupy none, nor does the origin, which files use for
+    shots without a return.
+    """
+    points = points[in_view(points, projection) & (points.norm(dim=-1) > 0)]
     sensor = projection.sensor
     occupied = torch.zeros(sensor.beams, sensor.columns, dtype=torch.bool)
     occupied[projection.pixel_of(points)] = True
@@ -242,7 +247,7 @@ def _occupied(points: Tensor, projection: Projection) -> Tensor:
 def held_out_errors(completed: Tensor, range_m: Tensor, missing: Tensor) -> dict[str, Any]:
     """Errors of completions ``(B, H, W)`` on the returns of the scan, beside interpolations.
 
-    Ranges are compared where the scan and all methods have a return; empty without any there.
+    Ranges are compared where the scan and all methods have a return; empty if they share none.
     """
     if not ((range_m > 0) & missing).any():
         return {}
@@ -250,6 +255,8 @@ def held_out_errors(completed: Tensor, range_m: Tensor, missing: Tensor) -> dict
     for how in ("linear", "nearest"):
         images[how] = interpolate_gaps(range_m, missing, how)[None]
     common = missing & (torch.cat(list(images.values())) > 0).all(dim=0)
+    if not common.any():
+        return {}
     return {
         name: {
             "mae_m": range_error_m(image, range_m.expand_as(image), common),
@@ -266,7 +273,7 @@ def _mean_errors(errors: Sequence[dict[str, Any]]) -> dict[str, Any]:
         return {}
     return {
         method: {
-            key: float(np.nanmean([error[method][key] for error in measured]))
+            key: float(np.mean([error[method][key] for error in measured]))
             for key in measured[0][method]
         }
         for method in _METHODS

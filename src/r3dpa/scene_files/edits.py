@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -28,7 +27,6 @@ from r3dpa.editing.gaps import check_view, in_view
 from r3dpa.editing.regions import check_mask
 from r3dpa.features import feature_source
 from r3dpa.flow.sampler import SamplerConfig
-from r3dpa.flow.solvers import evaluations
 from r3dpa.geometry import Pixels, in_range, project_pixels
 from r3dpa.io import atomic_path, json_values, usable_device, write_text
 from r3dpa.nn import VelocityNetwork
@@ -240,11 +238,8 @@ class EditSession:
 
     @contextmanager
     def _progress(self, command: str) -> Iterator[None]:
-        """Bar of network evaluations of whole batches, to noise and back."""
-        steps = evaluations(self.options.solver, self.settings.steps)
-        batches = math.ceil(self.num / self.options.batch_size)
-        total = steps * (batches + 1)
-        with tqdm(total=total, unit="evaluation", desc=command, disable=None) as bar:
+        """Counter of network evaluations of whole batches."""
+        with tqdm(unit="evaluation", desc=command, disable=None) as bar:
 
             def count(*_: Any) -> None:  # what a hook returns would become the output
                 bar.update()

@@ -53,8 +53,8 @@ class EditOptions(SceneOptions):
         solver: ODE solver, to noise and back; ``midpoint`` has the least error there and back.
         steps: Solver steps from data to noise; default: 16, of baselines 32.
         shift: Finer steps near noise (above 1) or data (below 1).
-        columns: Columns of files without names, such as ``x,y,z,intensity,ring``; default: by the
-            values.
+        columns: Columns of files without names, such as ``x,y,z,intensity,ring``; default:
+            inferred from the values.
     """
 
     solver: ODESolver = "midpoint"
@@ -71,8 +71,8 @@ class FolderOptions:
         out: Folder of the results.
         seed: Of the random draws, together with the name of each scan.
         workers: Processes.
-        columns: Columns of files without names, such as ``x,y,z,intensity,ring``; default: by the
-            values.
+        columns: Columns of files without names, such as ``x,y,z,intensity,ring``; default:
+            inferred from the values.
         drop_nan: Leave out points with NaN.
         show: Scans on the page at most.
     """

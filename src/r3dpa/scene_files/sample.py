@@ -28,7 +28,7 @@ def sample(
     sensor: str | None = None,
     **options: Any,
 ) -> str:
-    """Generate scenes from a checkpoint: points, range images, pictures and a page to turn.
+    """Generate scenes from a checkpoint: points, range images, pictures and an interactive page.
 
     Points have an intensity, and ``labels`` the classes of KITTI-360, where the checkpoint
     generates them. The same command completes an interrupted run; with a greater ``--num`` it adds
@@ -37,18 +37,18 @@ def sample(
 
     Args:
         num: Number of scenes.
-        quality: Measured solver, steps and shift, of which the options below change single ones;
-            default: good, or of a baseline, its published sampler. ``instant`` needs a checkpoint
+        quality: Preset of solver, steps and shift; the options below override single values;
+            default: good, or the published sampler of a baseline. ``instant`` needs a checkpoint
             of stage few_step, as does ``average_velocity``.
-        solver: ODE solver, ``euler_maruyama`` for the SDE, ``ddpm``, or ``average_velocity`` for 1,
-            2, 4 or 8 steps of any length.
+        solver: ODE solver, ``euler_maruyama`` for the SDE, ``ddpm`` or ``ddim`` for ancestral
+            steps, or ``average_velocity`` for 1, 2, 4 or 8 steps of any length.
         steps: Solver steps.
         shift: Finer steps near noise (above 1) or data (below 1) of the ODE.
-        eta: Noise strength of the SDE; default: 1, as published.
+        eta: Noise strength of the SDE or of ``ddpm``; default: 1, as published.
         sde_last: Last SDE step: ``denoise`` (default) or ``mean`` as in the official sampler.
         autoguidance: Snapshot of a weaker model to guide away from; doubles the evaluations.
-        guidance_scale: Strength of guidance, 1 for none; default: as the weights record, which are
-            guided away from themselves without one attention map; 2 with ``--autoguidance``.
+        guidance_scale: Strength of guidance, 1 for none; default: the strength of
+            perturbed-attention guidance recorded in the checkpoint; 2 with ``--autoguidance``.
         guidance_interval: Times of autoguidance, such as ``0.2 0.8``; 0 is data, 1 noise; default:
             all.
         decoder: Decoder of the VAE or the thin one of stage few_step; default: thin for
@@ -96,7 +96,8 @@ def sample(
         decoder = "thin"
     guidance, about_guide = None, None
     if autoguidance is not None:
-        scale, guidance_scale = 2.0 if guidance_scale is None else guidance_scale, 1.0
+        scale = 2.0 if guidance_scale is None else guidance_scale
+        guidance_scale = 1.0  # autoguidance replaces perturbed attention
         interval = guidance_interval or (0.0, 1.0)
         guidance, about_guide = autoguidance_of(
             autoguidance, checkpoint, files.weights, device, scale, interval
