@@ -22,6 +22,7 @@ import json
 import math
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +35,7 @@ from r3dpa.data.feature_grids import grid_of_points
 from r3dpa.data.scans import evenly
 from r3dpa.editing import EditSettings, SceneEditor, most_like_first
 from r3dpa.editing.objects import ObjectLibrary
-from r3dpa.editing.regions import box3d, sector_weights
+from r3dpa.editing.regions import box3d, in_box3d, sector_weights
 from r3dpa.features import WaffleIronS2
 from r3dpa.geometry import SEMANTIC_CLASSES, Pixels, unproject
 
@@ -71,12 +72,6 @@ def points_made(scene, scan, projection):
     return points_at_pixels(Pixels(scene.range_m, intensity), projection)
 
 
-def inside(points, centre, size):
-    """Which points ``(P, 3)`` lie in a box along the axes, 0.2 m wider on all sides."""
-    half = torch.tensor(size) / 2 + 0.2
-    return ((points[:, :3] - torch.tensor(centre)).abs() <= half).all(dim=1)
-
-
 def free_box(pixels, projection, size, grounds, generator):
     """Centre of a box on free ground that nothing hides, and its mask; None if none is found."""
     points = unproject(pixels.range_m, projection)
@@ -91,7 +86,7 @@ def free_box(pixels, projection, size, grounds, generator):
         front = math.hypot(*place) - max(size[:2]) / 2
         hidden = mask & (pixels.range_m > 0) & (pixels.range_m < front)
         raised = (pixels.range_m > 0) & (points[..., 2] > place[2] + GROUND_M)
-        if not (hidden & raised).any() and not inside(points[raised], centre, size).any():
+        if not (hidden & raised).any() and not in_box3d(points[raised], centre, size, ground_m=0).any():
             return centre, mask
     return None
 
@@ -99,7 +94,7 @@ def free_box(pixels, projection, size, grounds, generator):
 def judge(points, matches, centre, size, top_deg):
     """Whether the points ``(P, 4)`` in a box, some of the class, hold it: by class, and by size."""
     floor = centre[2] - size[2] / 2
-    chosen = inside(points, centre, size) & (points[:, 2] > floor + GROUND_M)
+    chosen = in_box3d(points[:, :3], centre, size, ground_m=GROUND_M)
     if chosen.sum() < 5:
         return False, False
     by_class = (chosen & matches).sum() >= max(5, chosen.sum() / 2)
@@ -127,7 +122,9 @@ def inpainting(editors, scans, library, teacher, name, draws):
             start = time.perf_counter()
             made = editor.inpaint(pixels, mask, indices, feature=features[how])
             seconds = (time.perf_counter() - start) / draws
-            made = most_like_first(made, mask, feature, teacher.extractor, generator.sit.grid_size)
+            in_box = partial(in_box3d, centre_m=centre, size_m=size)
+            grid_size = generator.sit.grid_size
+            made = most_like_first(made, mask, feature, teacher.extractor, grid_size, in_box)
             found = []
             for scene in made:
                 points = points_made(scene, pixels, projection)

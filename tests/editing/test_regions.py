@@ -13,6 +13,7 @@ from r3dpa.editing.regions import (
     check_mask,
     dilated,
     dropped_beams,
+    in_box3d,
     mask_of_tokens,
     sector,
     sector_weights,
@@ -85,7 +86,7 @@ def test_a_sector_and_the_rest_of_the_turn_share_no_pixel_and_leave_none():
         (lambda: box3d(COARSE, (0, 0.5, 0.5), (0.1, 0.1, 0.1)), r"no ray meets it.* 1 to 56 m"),
         (lambda: box3d(COARSE, (10, 0, 9.5), (4, 2, 1)), r"no ray meets it.* -15\.0 to 15\.0"),
         (lambda: box3d(COARSE, (20, 0, 0), (0.1, 0.1, 0.1)), "no ray meets it"),
-        (lambda: box3d(COARSE, (0.5, 0, 0), (4, 2, 2)), "holds the sensor"),
+        (lambda: box3d(COARSE, (0.5, 0, 0), (4, 2, 2)), "contains the sensor"),
         (lambda: box3d(COARSE, (10, 0, 0), (4, 0, 2)), "above 0"),
         (lambda: box3d(COARSE, (10, 0, math.nan), (4, 1, 2)), "finite"),
         (lambda: box3d(COARSE, (10, 0), (4, 1, 2)), "needs x, y, z"),
@@ -116,6 +117,17 @@ def test_box_ahead_takes_the_pixels_it_fills():
     assert left.equal(box3d(COARSE, (0, 10.5, 0), (1, 5.3, 3.6), yaw_deg=90))
     # Behind, across the seam.
     assert selected(box3d(COARSE, (-10.5, 0, 0), (1, 5.3, 3.6)), 1) == [0, 35]
+
+
+def test_points_in_a_turned_box():
+    """A box of 4 x 2 x 1 m turned by 90 degrees is 2 m long along x and 4 m along y."""
+    points = torch.tensor([[10.9, 1.9, 0.4], [11.1, 0, 0], [10, 2.1, 0], [10, 0, 0.6], [10, 0, 0]])
+    box = ((10, 0, 0), (4, 2, 1), 90)
+    exact = {"margin_m": 0, "ground_m": 0}
+    assert in_box3d(points, *box, **exact).tolist() == [True, False, False, False, True]
+    assert in_box3d(points, *box).all()
+    low = torch.tensor([[10.0, 0, -0.26], [10, 0, -0.24]])  # the bottom is 0.5 m below the centre
+    assert in_box3d(low, *box).tolist() == [False, True]
 
 
 def test_box_beyond_the_range_counts_only_as_far_as_the_sensor_sees():

@@ -84,6 +84,10 @@ def inpaint(
     from r3dpa.scene_files.edits import EditSession
     from r3dpa.scene_files.generated import feature_source_of
 
+    feature = extractor = inside = None
+    if object is not None and objects is not None:
+        library = ObjectLibrary.load(objects)
+        feature = library.feature(object)  # an unknown name is refused before the weights are read
     session = EditSession(shared, num, strength, window)
     source = session.read(scan)
     if mask is not None:
@@ -91,12 +95,15 @@ def inpaint(
     elif box is not None:
         region = regions.angle_box(session.projection, *box)
     elif box3d is not None:
-        region = regions.box3d(session.projection, box3d[:3], box3d[3:6], box3d[6])
-    feature = extractor = None
-    if object is not None and objects is not None:
-        library = ObjectLibrary.load(objects)
+        place: dict[str, Any] = {
+            "centre_m": box3d[:3],
+            "size_m": box3d[3:6],
+            "yaw_deg": box3d[6],
+        }
+        region = regions.box3d(session.projection, **place)
+        inside = partial(regions.in_box3d, **place)
+    if feature is not None:
         library.check_source(feature_source_of(session.checkpoint), session.sit.feature_dim)
-        feature = library.feature(object)
         if features_ckpt is not None or library.source in OWN_WEIGHTS:
             extractor = session.extractor(features_ckpt)
 
@@ -112,7 +119,8 @@ def inpaint(
         )
         if feature is None or extractor is None:
             return edits
-        return most_like_first(edits, region, feature, extractor, session.sit.grid_size)
+        grid_size = session.sit.grid_size
+        return most_like_first(edits, region, feature, extractor, grid_size, inside)
 
     scans, names = {f"scan {scan.stem}": source}, ("kept", object or "generated anew")
     return session.write("inpaint", arguments, scans, run, region, names, feature is not None)

@@ -92,6 +92,8 @@ class EditResult(SceneBatch):
         draws: ``(B,)`` int64 number of each result among the draws, where they were ordered by
             :func:`r3dpa.editing.most_like_first`; else None.
         likeness: ``(B,)`` that they were ordered by, in [-1, 1]; else None.
+        points_inside: ``(B,)`` int64 points in the box of an object, where one was given for that
+            order; else None.
     """
 
     vae_error_m: float | None = None
@@ -99,6 +101,7 @@ class EditResult(SceneBatch):
     cosine: Tensor | None = None
     draws: Tensor | None = None
     likeness: Tensor | None = None
+    points_inside: Tensor | None = None
 
 
 class SceneEditor:

@@ -6,7 +6,7 @@ Letters: K values before the linear step, N = h * w cells, D feature width, C cl
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Self
@@ -237,13 +237,15 @@ def most_like_first(
     feature: Tensor,
     extractor: Extractor,
     grid_size: tuple[int, int],
+    inside: Callable[[Tensor], Tensor] | None = None,
 ) -> EditResult:
     """Order the draws of an inpainted part by their likeness to an object, the greatest first.
 
     Likeness is the mean cosine between the feature of the object and the features of the part's
-    cells, which the feature source takes from the points of the draw. The ``cosine`` of the edits
-    cannot replace it: it is of features that the network predicts, which guidance may raise
-    without making an object.
+    cells, which the feature source takes from the points of the draw. Where the object has a box,
+    points in front of it and behind it do not count, and a cell without others has a cosine of 0.
+    The ``cosine`` of the edits cannot replace it: it is of features that the network predicts,
+    which guidance may raise without making an object.
 
     Args:
         edits: Draws of :meth:`SceneEditor.inpaint`.
@@ -251,18 +253,28 @@ def most_like_first(
         feature: ``(D,)`` of the object, see :meth:`ObjectLibrary.feature`.
         extractor: Feature source of the object.
         grid_size: Rows and columns (h, w) of the cells.
+        inside: Which of points ``(P, 3)`` lie in the box of the object, ``(P,)`` bool, such as
+            :func:`r3dpa.editing.regions.in_box3d`. Default: the part has no box.
 
     Returns:
-        The edits in that order, with their ``draws`` and ``likeness``.
+        The edits in that order, with their ``draws`` and ``likeness``, and ``points_inside`` if
+        there is a box.
     """
     tokens, projection = token_mask(pixel_mask, grid_size), edits.projection
-    cosines = []
+    cosines, counts = [], []
     for scene in edits:
         points = points_at_pixels(Pixels(scene.range_m, scene.intensity), projection)
-        cells = grid_of_points(extractor, points, projection, grid_size)[tokens]
+        counted = None if inside is None else inside(points[:, :3])
+        cells = grid_of_points(extractor, points, projection, grid_size, counted)[tokens]
         cosines.append(F.cosine_similarity(cells, feature, dim=1).mean())
+        counts.append(len(points) if counted is None else int(counted.sum()))
     likeness = torch.stack(cosines)
-    measured = replace(edits, draws=torch.arange(len(edits)), likeness=likeness)
+    measured = replace(
+        edits,
+        draws=torch.arange(len(edits)),
+        likeness=likeness,
+        points_inside=None if inside is None else torch.tensor(counts),
+    )
     return measured[likeness.argsort(descending=True, stable=True)]
 
 

@@ -58,6 +58,34 @@ def sector(projection: Projection, azimuth_from_deg: float, azimuth_to_deg: floa
     return check_mask(columns.repeat(projection.sensor.beams, 1), what)
 
 
+def in_box3d(
+    points: Tensor,
+    centre_m: Sequence[float],
+    size_m: Sequence[float],
+    yaw_deg: float = 0.0,
+    margin_m: float = 0.2,
+    ground_m: float = 0.25,
+) -> Tensor:
+    """Whether points ``(P, 3)`` belong to what stands in a box, bool.
+
+    The box is ``margin_m`` wider on all sides, but what is less than ``ground_m`` above its bottom
+    is ground. See :func:`box3d` for the other arguments.
+    """
+    from_centre = points.double() - torch.tensor(centre_m, dtype=torch.float64)
+    half = torch.tensor(size_m, dtype=torch.float64) / 2
+    inside = ((from_centre @ _box_axes(yaw_deg).T).abs() <= half + margin_m).all(dim=-1)
+    return inside & (from_centre[..., 2] > ground_m - half[2])
+
+
+def _box_axes(yaw_deg: float) -> Tensor:
+    """Axes of a turned box, ``(3, 3)`` float64, one per row."""
+    yaw = math.radians(yaw_deg)
+    return torch.tensor(
+        [[math.cos(yaw), math.sin(yaw), 0], [-math.sin(yaw), math.cos(yaw), 0], [0, 0, 1]],
+        dtype=torch.float64,
+    )
+
+
 def box3d(
     projection: Projection, centre_m: Sequence[float], size_m: Sequence[float], yaw_deg: float = 0.0
 ) -> Tensor:
@@ -85,11 +113,7 @@ def box3d(
         raise ValueError(f"{what}: needs x, y, z of the centre and length, width, height")
     if not all(map(math.isfinite, (*centre_m, *size_m, yaw_deg))) or min(size_m) <= 0:
         raise ValueError(f"{what}: needs finite numbers, and a size above 0 on every axis")
-    yaw = math.radians(yaw_deg)
-    axes = torch.tensor(
-        [[math.cos(yaw), math.sin(yaw), 0], [-math.sin(yaw), math.cos(yaw), 0], [0, 0, 1]],
-        dtype=torch.float64,
-    )
+    axes = _box_axes(yaw_deg)
     centre = axes @ torch.tensor(centre_m, dtype=torch.float64)
     half = torch.tensor(size_m, dtype=torch.float64) / 2
     if (centre.abs() <= half).all():

@@ -206,13 +206,16 @@ class EditSession:
             self.show(command, scans, result.range_m, parts, part_names)
             measured = ("nfe", "vae_error_m", "round_trip_m")
             request |= {name: getattr(result, name) for name in measured} | {"seconds": seconds}
-            for name in ("cosine", "draws", "likeness"):
+            for name in ("cosine", "draws", "likeness", "points_inside"):
                 values = getattr(result, name)
                 request[name] = None if values is None else values.tolist()
             writer.finish(request)
+        counts = ""
+        if result.points_inside is not None:
+            counts = f"points in the box: {', '.join(map(str, request['points_inside']))}\n"
         return (
             f"{command}: {self.num} scene{'s' * (self.num != 1)} in {options.out}, {result.nfe} "
-            f"network evaluations each, {seconds:.3g} s; errors are in metadata.json\n"
+            f"network evaluations each, {seconds:.3g} s; errors are in metadata.json\n{counts}"
             f"open {options.out / 'edit.png'} and {options.out / 'edit.html'}"
         )
 

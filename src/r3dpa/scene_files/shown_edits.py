@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import cast
 
 from torch import Tensor
@@ -69,5 +70,6 @@ class ShownEdits:
         place = regions.box3d(self.projection, _CAR_CENTRE_M, _CAR_SIZE_M)
         draws = self.editor.inpaint(scene, place, _CAR_DRAWS, self.seed, feature=car)
         if self.teacher is not None:
-            draws = most_like_first(draws, place, car, self.teacher, self.grid_size)
+            inside = partial(regions.in_box3d, centre_m=_CAR_CENTRE_M, size_m=_CAR_SIZE_M)
+            draws = most_like_first(draws, place, car, self.teacher, self.grid_size, inside)
         return draws.range_m[:_CARS_SHOWN]
