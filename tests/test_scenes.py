@@ -12,7 +12,7 @@ import torch
 from r3dpa.data import read_scan
 from r3dpa.editing import EditResult
 from r3dpa.geometry import LidarSensor, SphericalProjection, points_of
-from r3dpa.scenes import Scene, SceneBatch
+from r3dpa.scenes import Scene, SceneBatch, scan_pixels
 
 PROJECTION = SphericalProjection(LidarSensor(beams=16, columns=64))
 
@@ -62,6 +62,12 @@ def test_reprs_are_one_line(labelled, edited):
     assert repr(edited[0]) == f"Scene({len(edited[0].points)} points, 16 x 64 pixels of range)"
 
 
+@pytest.mark.parametrize("image", [torch.full((16, 64), 7000.0), torch.full((16, 64), -1.0)])
+def test_an_image_in_millimetres_or_without_a_return_is_no_scan(image):
+    with pytest.raises(ValueError, match=r"no return within 1\.\.56 m; ranges must be metres"):
+        scan_pixels(image, PROJECTION)
+
+
 def test_saved_scenes_are_those_of_a_sample(labelled, tmp_path):
     folder = labelled.save(tmp_path / "scenes", ("bin", "npz"))
     assert folder == tmp_path / "scenes"
@@ -72,6 +78,8 @@ def test_saved_scenes_are_those_of_a_sample(labelled, tmp_path):
     assert (folder / "labels" / "000002.label").stat().st_size == 4 * len(labelled[2].points)
     with pytest.raises(ValueError, match="holds scenes already"):
         labelled.save(folder)
+    with pytest.raises(ValueError, match=r"metadata\.json is a file; give a folder"):
+        labelled.save(folder / "metadata.json")
     labelled[:1].save(folder, overwrite=True)
     assert len(np.load(folder / "range_m.npy")) == 1
 

@@ -75,6 +75,11 @@ def scan_pixels(scan: ScanLike, projection: Projection) -> Pixels:
     if not values.isfinite().all():
         raise ValueError("the scan has NaN or infinite values; leave these points out")
     if values.shape == (sensor.beams, sensor.columns):
+        if not ((values >= sensor.range_min_m) & (values <= sensor.range_max_m)).any():
+            raise ValueError(
+                f"the range image has no return within {sensor.range_min_m:g}.."
+                f"{sensor.range_max_m:g} m; ranges must be metres"
+            )
         return Pixels(values)
     if values.ndim != 2 or values.shape[1] not in (3, 4):
         raise ValueError(
@@ -239,10 +244,15 @@ class SceneBatch:
             folder: New folder, or one with earlier scenes and ``overwrite``.
             formats: Files of points: ``bin``, ``ply``, ``npz``.
             overwrite: Replace earlier scenes.
+
+        Raises:
+            ValueError: If the folder is a file, or holds scenes and ``overwrite`` is False.
         """
         from r3dpa.data.scene_writer import SceneWriter
 
         folder = Path(folder)
+        if folder.is_file():
+            raise ValueError(f"{folder} is a file; give a folder")
         if (folder / "metadata.json").exists() and not overwrite:
             raise ValueError(
                 f"{folder} holds scenes already; give another folder or overwrite=True"

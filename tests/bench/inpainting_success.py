@@ -86,7 +86,8 @@ def free_box(pixels, projection, size, grounds, generator):
         front = math.hypot(*place) - max(size[:2]) / 2
         hidden = mask & (pixels.range_m > 0) & (pixels.range_m < front)
         raised = (pixels.range_m > 0) & (points[..., 2] > place[2] + GROUND_M)
-        if not (hidden & raised).any() and not in_box3d(points[raised], centre, size, ground_m=0).any():
+        occupied = in_box3d(points[raised], centre, size, ground_m=0)
+        if not (hidden & raised).any() and not occupied.any():
             return centre, mask
     return None
 

@@ -97,6 +97,7 @@ def test_a_sector_and_the_rest_of_the_turn_share_no_pixel_and_leave_none():
         # Every token has a pixel of every second beam.
         (lambda: token_mask(dropped_beams(FINE, range(0, 32, 2)), (8, 16)), "selects all of 128"),
         (lambda: check_mask(torch.zeros(2, 3, dtype=torch.bool), "mask a.png"), "mask a.png: sel"),
+        (lambda: check_mask(torch.ones(2, 3), "mask"), "mask: must be of bool, got torch.float32"),
     ],
 )
 def test_a_mask_that_cannot_be_used_is_refused_with_its_numbers(call, message):

@@ -162,7 +162,13 @@ def sensor_pair(projection: Projection, other: Projection) -> Tensor:
 
 
 def check_mask(mask: Tensor, what: str) -> Tensor:
-    """Return the mask; raise a ValueError that names ``what`` if it selects nothing or all."""
+    """Return the mask.
+
+    Raises:
+        ValueError: If it is not of bool, or selects nothing or all; names ``what``.
+    """
+    if mask.dtype != torch.bool:
+        raise ValueError(f"{what}: must be of bool, got {mask.dtype}; give for example mask > 0")
     if not mask.any():
         raise ValueError(f"{what}: selects nothing, so that nothing would change; make it larger")
     if mask.all():
