@@ -35,6 +35,7 @@ from r3dpa.generation import SamplerConfig, SceneGenerator, scene_indices
 from r3dpa.geometry import UNKNOWN_CLASS, Pixels, labels_of
 from r3dpa.scenes import ScanLike, SceneBatch, map_pixels, scan_pixels
 
+COMPLETION_START = 0.2  #: time of the noise that completions start from
 _COMPLETION_DRAWS = 3  # their median has a smaller error than one draw
 
 
@@ -270,7 +271,7 @@ class SceneEditor:
         indices: int | Sequence[int] = 1,
         seed: int = 0,
         *,
-        start: float = 0.2,
+        start: float = COMPLETION_START,
     ) -> EditResult:
         """Fill missing pixels of a scan: a sector, beams, or any others.
 

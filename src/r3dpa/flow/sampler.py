@@ -21,11 +21,17 @@ OdeSolverName = Literal["euler", "heun", "midpoint", "ab2", "ab3", "dpmpp_2m", "
 Solver = Literal[OdeSolverName, "euler_maruyama", "ddpm", "ddim", "average_velocity"]
 Quality = Literal["instant", "draft", "good", "best"]
 SDELast = Literal["denoise", "mean"]
-_READS: dict[str, tuple[str, ...]] = {
-    "euler_maruyama": ("eta", "sde_last", "sde_last_time"),
-    "ddpm": ("shift", "eta"),
-    "average_velocity": (),
-}
+_SETTINGS = ("shift", "eta", "sde_last", "sde_last_time")
+
+
+def _settings_of(solver: str) -> tuple[str, ...]:
+    """Settings that a solver reads, beside its steps."""
+    others: dict[str, tuple[str, ...]] = {
+        "euler_maruyama": ("eta", "sde_last", "sde_last_time"),
+        "ddpm": ("shift", "eta"),
+        "average_velocity": (),
+    }
+    return others.get(solver, ("shift",))
 
 
 @dataclass(frozen=True)
@@ -82,10 +88,10 @@ class SamplerConfig:
                 f"average_velocity takes {', '.join(map(str, AVERAGE_STEPS))} steps, as "
                 f"stage few_step trains them, got {self.steps}"
             )
-        read = _READS.get(self.solver, ("shift",))
-        for name in ("shift", "eta", "sde_last", "sde_last_time"):
+        read = _settings_of(self.solver)
+        for name in _SETTINGS:
             if name not in read and getattr(self, name) != getattr(type(self), name):
-                readers = [k for k in get_args(Solver) if name in _READS.get(k, ("shift",))]
+                readers = [k for k in get_args(Solver) if name in _settings_of(k)]
                 raise ValueError(
                     f"solver {self.solver} does not read {name}, which is for "
                     f"{', '.join(readers)}; drop one"
@@ -108,7 +114,7 @@ class SamplerConfig:
     def changed(self, **settings: Any) -> Self:
         """This sampler with other settings; another solver keeps the settings that it reads."""
         solver = settings.get("solver", self.solver)
-        read = ("steps", *_READS.get(solver, ("shift",)))
+        read = ("steps", *_settings_of(solver))
         kept = {name: getattr(self, name) for name in read}
         return type(self)(**{"solver": solver, **kept, **settings})
 
@@ -116,7 +122,7 @@ class SamplerConfig:
     def summary(self) -> str:
         """Solver, steps, and the settings that differ from their defaults, in one line."""
         parts = [str(self.solver), f"{self.steps} steps"]
-        for name in ("shift", "eta", "sde_last", "sde_last_time"):
+        for name in _SETTINGS:
             if getattr(self, name) != getattr(type(self), name):
                 parts.append(f"{name} {getattr(self, name)}")
         return ", ".join(parts)

@@ -19,6 +19,7 @@ from lidarsim.changed_scans import write_below
 from lidarsim.clouds import PointCloud, find_files, read_cloud
 from r3dpa.data.scene_writer import SceneWriter
 from r3dpa.editing import EditResult
+from r3dpa.editing.editor import COMPLETION_START
 from r3dpa.editing.gaps import in_view, interpolate_gaps, range_error_m, unseen_pixels
 from r3dpa.editing.regions import check_mask, dropped_beams, sector, sensor_pair
 from r3dpa.geometry import Pixels, Projection, SphericalProjection, points_of, values_at_returns
@@ -27,6 +28,7 @@ from r3dpa.scene_files.edits import EditSession, ScanView
 from r3dpa.scene_files.options import EditOptions
 
 _SCANS = "scans"  # folder of the completed scans
+_RESAMPLINGS = 10  # of RePaint, by default
 _METHODS = ("completed", "linear", "nearest")
 # notebooks/results/completion.json
 _BENCHMARK = (
@@ -118,11 +120,11 @@ class CompletionJob:
         session = _session(self.options, self.num)
         cloud, view, missing = self.read(path)
         if session.baseline is not None:
-            result = session.complete(view, missing, self.resamplings or 10)
+            result = session.complete(view, missing, self.resamplings or _RESAMPLINGS)
         else:
-            start = {} if self.start is None else {"start": self.start}
+            start = COMPLETION_START if self.start is None else self.start
             result = session.editor.complete(
-                view.pixels, missing, self.num, self.options.seed, **start
+                view.pixels, missing, self.num, self.options.seed, start=start
             )
         for index in range(self.num):
             completed = _completed_cloud(cloud, result, index, missing)
