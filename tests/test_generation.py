@@ -91,6 +91,9 @@ def test_options_that_do_not_fit_are_refused():
         SceneGenerator(*tiny_networks(), GEOMETRY, ODE, batch_size=0)
     with pytest.raises(ValueError, match="unknown precision 'fp16'; choose from fp32, bf16"):
         generator(precision="fp16")
+    for name, value in (("weights", "EMA"), ("decoder", "small")):
+        with pytest.raises(ValueError, match=f"unknown {name} {value!r}; choose from"):
+            SceneGenerator.from_checkpoint("r3dpa-s", **{name: value})
     with pytest.raises(ValueError, match="unknown quality 'GOOD'; choose from instant, draft"):
         SamplerConfig.of_quality("GOOD")
 
@@ -147,6 +150,8 @@ def test_exact_velocity_leads_to_the_data():
         ),
         ({"solver": "ab2", "sde_last": "mean"}, r"solver ab2 does not read sde_last,"),
         ({"solver": "ab2", "sde_last_time": 0.1}, r"solver ab2 does not read sde_last_time"),
+        ({"sde_last": "noise"}, r"sde_last must be one of denoise, mean, got 'noise'"),
+        ({"sde_last_time": 2.0}, r"sde_last_time must lie in \(0, 1\), got 2"),
         ({"shift": 2.0}, r"solver euler_maruyama does not read shift, which is for euler, heun"),
     ],
 )
@@ -178,8 +183,6 @@ def test_a_diverged_network_gives_nan_and_no_empty_scene():
 
 def test_preparing_says_what_the_first_scene_would():
     """And computes what that would wait for."""
-    with pytest.raises(ValueError, match=r"must lie in \(0, 1\), got 2"):
-        generator(SamplerConfig(sde_last_time=2.0)).prepare()
     scenes, asked = generator(ODE), []
     modulations = scenes.sit.modulations
     scenes.sit.modulations = lambda time: asked.append(time.tolist()) or modulations(time)

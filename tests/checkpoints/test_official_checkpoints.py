@@ -82,6 +82,13 @@ class TestOfficial:
         with pytest.raises(ValueError, match="legacy_upsample=True"):
             to_official(replace(checkpoint, networks=networks))
 
+    def test_an_export_of_averaged_weights_has_a_counterpart(self, checkpoint):
+        names = ("vae", "ema", "ema_latent_norm")
+        exported = replace(checkpoint, networks={name: checkpoint.network(name) for name in names})
+        content = to_official(exported)
+        assert {"vae", "ema"} <= set(content)
+        assert content["args"].bn_momentum == 0.1
+
     def test_options_are_made_from_our_arguments(self, checkpoint):
         args = vars(to_official(checkpoint)["args"])
         expected = {"vae": "h2p2d4", "num_classes": 1, "cfg_prob": 0.0, "encoder_depth": 2}

@@ -303,6 +303,8 @@ class TestNamedSensors:
         assert len(train) == 3 * 2 + 3
         assert {scan.path.parent.name for scan in val} == {"own"}
         assert not {scan.path for scan in train} & {scan.path for scan in val}
+        module.setup("predict")  # each scan once
+        assert module.all_set.scans == sorted({*train, *val})
 
     def test_settings_of_an_image_keep_their_projection_and_codec(self, folders):
         module = LidarDataModule(str(folders / "own"), sensor=LidarSensor(16, 512))

@@ -311,3 +311,10 @@ def test_rate_rises_stays_and_falls_by_step_alone():
         train(module, TinyData([False] * 5))
         rates = {group["name"]: group["lr"] for group in module.optimizers().param_groups}
         assert rates == wanted
+
+
+@pytest.mark.parametrize("option", [{"decay_steps": 4}, {"cosine": True}])
+def test_a_rate_that_falls_needs_the_last_step(option):
+    with pytest.raises(ValueError, match=r"need the last step: set --trainer\.max_steps"):
+        OptimizerConfig(**option).rate(0, -1)
+    assert OptimizerConfig(lr=2.0).rate(0, -1) == 2.0
