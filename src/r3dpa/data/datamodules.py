@@ -328,7 +328,7 @@ class LidarDataModule(LoaderModule):
         return default_features_dir(self.scans, name)
 
     def _fitted_projection(self) -> Projection:
-        """Projection of the images; that of rings is fitted to the first training scans."""
+        """Projection of the images; rings are fitted to the first training scans."""
         if self.projection_kind != "rings":
             return self._known_projection
         train, val = self.split()
