@@ -230,18 +230,7 @@ class PointCloud:
         Raises:
             ScanError: With what to do.
         """
-        if len(self) < _FEWEST_POINTS:
-            raise ScanError(
-                f"{self.where}: holds {len(self)} of at least {_FEWEST_POINTS} points; remove it"
-            )
-        range_m = np.linalg.norm(self.points.astype(float), axis=1)
-        median, largest = float(np.median(range_m)), float(range_m.max())
-        if median > _FAR_MEDIAN_M or largest < _NEAR_MAX_M:
-            advice = "divide the coordinates, by 100 or 1000" if median > 1 else "multiply them"
-            raise ScanError(
-                f"{self.where}: ranges have the median {median:.3g} and reach {largest:.4g}, "
-                f"which are no metres: {advice}"
-            )
+        check_metres(self.where, self.points)
 
     def describe(self) -> str:
         """Format, columns, number of points, ranges and intensities in one line."""
@@ -260,6 +249,26 @@ class PointCloud:
     def where(self) -> str:
         """Path of the file, for messages."""
         return "the cloud" if self.file is None else str(self.file.path)
+
+
+def check_metres(where: str | Path, points: NDArray[np.floating]) -> None:
+    """Refuse fewer than 16 points ``(P, 3)`` or more columns, and ranges that cannot be metres.
+
+    Raises:
+        ScanError: With what to do; ``where`` names the scan.
+    """
+    if len(points) < _FEWEST_POINTS:
+        raise ScanError(
+            f"{where}: holds {len(points)} of at least {_FEWEST_POINTS} points; remove it"
+        )
+    range_m = np.linalg.norm(points[:, :3].astype(float), axis=1)
+    median, largest = float(np.median(range_m)), float(range_m.max())
+    if median > _FAR_MEDIAN_M or largest < _NEAR_MAX_M:
+        advice = "divide the coordinates, by 100 or 1000" if median > 1 else "multiply them"
+        raise ScanError(
+            f"{where}: ranges have the median {median:.3g} and reach {largest:.4g}, "
+            f"which are no metres: {advice}"
+        )
 
 
 def suffix_of(path: Path) -> str:

@@ -41,7 +41,11 @@ def read_scan(
             within the range limits of ``sensor``.
     """
     path = Path(path)
-    cloud = read_cloud(path, columns, with_labels=False)
+    return rows_of(path, read_cloud(path, columns, with_labels=False), sensor)
+
+
+def rows_of(path: Path, cloud: PointCloud, sensor: LidarSensor | None = None) -> np.ndarray:
+    """Return points ``(P, 4)`` of the cloud of a file, as :func:`read_scan`."""
     if cloud.table.dtype == _KITTI and suffix_of(path) == ".bin":
         points = cloud.table.view("<f4").reshape(-1, 4).copy()
         _refuse_bright(path, points[:, 3])

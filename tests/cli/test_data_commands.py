@@ -160,6 +160,27 @@ def test_check_says_the_columns_and_beams_of_other_formats(tmp_path, capsys):
 class TestCheck:
     """What is no scan, what is skipped, and frames."""
 
+    def test_scans_in_millimetres_and_of_few_points_are_bad(self, tmp_path, capsys):
+        for number in range(6):  # more than are described
+            write_bin(tmp_path / f"{number}.bin", 1000 * points(seed=number) * [1, 1, 1, 0])
+        write_bin(tmp_path / "few.bin", points()[:10])
+        status, lines = check(tmp_path, capsys)
+        assert status == 1
+        bad = [line for line in lines if line.startswith("bad: ")]
+        assert len(bad) == 7
+        for line in bad[:6]:
+            assert "which are no metres: divide the coordinates, by 100 or 1000" in line
+        assert bad[6].endswith("few.bin: holds 10 of at least 16 points; remove it")
+        assert lines[-1].endswith("7 scans in 1 drive, problems: 7")
+
+    def test_what_prevents_a_description_is_a_problem(self, tmp_path, capsys):
+        write_bin(tmp_path / "a.bin", points())
+        (tmp_path / "a.label").write_bytes(bytes(12))
+        status, lines = check(tmp_path, capsys)
+        assert status == 1
+        assert sum("a.label: holds 3 labels but" in line for line in lines) == 1
+        assert lines[-1].endswith("problems: 1")
+
     @pytest.mark.parametrize(
         ("name", "says"),
         [

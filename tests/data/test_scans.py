@@ -24,6 +24,7 @@ from r3dpa.geometry import LidarSensor
 from r3dpa.io import atomic_path, refuse_name
 
 POINTS = np.array([[10, 0, -1, 0.5], [0, 20, 0.25, 0.0], [-30, 1, 2, 1.0]], np.float32)
+ENOUGH = np.tile(POINTS, (6, 1))  # points for ``check``
 
 
 def five_columns(count, times=None):
@@ -91,12 +92,12 @@ def problems(path):
 
 
 def test_check_says_the_intensities(tmp_path):
-    write_bin(tmp_path / "a.bin", POINTS)
+    write_bin(tmp_path / "a.bin", ENOUGH)
     text, usable = check(tmp_path)
     assert usable
     assert "intensity: 0..1\n" in text
     assert "1 scan in 1 drive, all usable" in text
-    write_bin(tmp_path / "a.bin", POINTS - np.float32([0, 0, 0, 0.25]))
+    write_bin(tmp_path / "a.bin", ENOUGH - np.float32([0, 0, 0, 0.25]))
     (problem,) = problems(tmp_path)
     assert "its values do not fit 4 or 5 columns x, y, z, intensity" in problem
 
@@ -225,7 +226,7 @@ def test_killed_writer_leaves_no_scan(tmp_path, make_scans):
     for folder in (tmp_path / "plain", raw):
         make_scans(folder, 1)
         with atomic_path(folder / "0000000001.bin") as temporary:
-            temporary.write_bytes(POINTS.tobytes())
+            temporary.write_bytes(ENOUGH.tobytes())
         temporary.write_bytes(b"half")
         assert len(list(folder.iterdir())) == 3
         assert [scan.frame for scan in find_scans(folder)] == ["0000000000", "0000000001"]

@@ -50,16 +50,19 @@ def check(folder: Path, *, columns: tuple[str, ...] = ()) -> None:
             others = find_files(folder)[1]
         except ScanError as error:
             lines.append(f"bad: {error}")
-    if not others:
-        text, usable = check_scans(folder)
+    errors: dict[Path, ScanError] = {}
     for file in others or evenly(kitti, 4):
         try:
             cloud = read_cloud(file, columns)
             cloud.check_metres()
             lines.append(describe_scan(cloud))
         except ScanError as error:
-            lines += [] if text else [f"bad: {error}"]
-            usable = usable and bool(text)
+            errors[file.resolve()] = error
+            lines += [f"bad: {error}"] if others else []
+    if others:
+        usable = not errors
+    else:
+        text, usable = check_scans(folder, errors)
     if not is_layout and (line := skipped_files(files_below(folder), others or kitti)):
         lines.append(line)
     sys.stdout.write("\n".join([*lines, *([text] if text else []), ""]))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from glob import has_magic
 from multiprocessing.pool import ThreadPool
@@ -16,8 +16,8 @@ from tqdm import tqdm
 
 from lidarsim import TRAIN_DRIVES, VAL_DRIVES, drive_name, expected_scans
 from lidarsim.cloud_formats import READABLE, READERS, ScanError, unreadable
-from lidarsim.clouds import files_below, suffix_of
-from lidarsim.scan_files import read_scan
+from lidarsim.clouds import files_below, read_cloud, suffix_of
+from lidarsim.scan_files import read_scan, rows_of
 from r3dpa.data.store import ItemKey
 from r3dpa.geometry import LidarSensor
 from r3dpa.io import refuse_name
@@ -183,12 +183,14 @@ def _drive_name(folder: Path, root: Path) -> str:
     return "/".join(parts) or root.name
 
 
-def check(path: str | Path) -> tuple[str, bool]:
+def check(path: str | Path, further: Mapping[Path, ScanError] | None = None) -> tuple[str, bool]:
     """Text about every scan of a data set, folder or file, and whether nothing is wrong with it.
 
     A folder with ``data_3d_raw``, or without any scan, is compared with the KITTI-360 layout and
     its nine LiDAR drives; a simulated one with its manifest (``ValueError`` if that is damaged).
-    Every scan needs a point within the range limits of :class:`LidarSensor`.
+    Every scan needs 16 points, ranges in metres, and a point within the range limits of
+    :class:`LidarSensor`. ``further`` are errors of scans by their resolved path, which are listed
+    where nothing else is wrong with the scan.
     """
     root, sensor = Path(path).absolute(), LidarSensor()
     scans = find_scans(root) if any(scan_files(root)) else []
@@ -197,7 +199,11 @@ def check(path: str | Path) -> tuple[str, bool]:
 
     def examine(scan: Scan) -> tuple[float, float] | str:
         try:
-            intensity = scan.read(sensor)[:, 3]
+            cloud = read_cloud(scan.path, scan.columns, with_labels=False)
+            cloud.check_metres()
+            intensity = rows_of(scan.path, cloud, sensor)[:, 3]
+            if further and (error := further.get(scan.path.resolve())):
+                raise error
         except ScanError as error:
             return f"bad: {error}"
         return float(intensity.min()), float(intensity.max())
