@@ -343,6 +343,15 @@ class TestView:
         assert self.show(tmp_path / "one.ply", tmp_path / "ply")[2] == [f"{tmp_path.name}/one"]
         assert self.show(tmp_path / "many.npz", tmp_path / "npz")[2] == ["many/a", "many/b"]
 
+    @pytest.mark.parametrize("name", ["a.bin", "a.npz"])
+    def test_scans_in_millimetres_are_refused(self, name, tmp_path):
+        scan = 1000 * points()[:, :3]
+        write = write_bin if name == "a.bin" else lambda path, scan: write_npz(path, [("a", scan)])
+        write(tmp_path / name, scan)
+        with pytest.raises(ScanError, match=r"a\.\w+: .*which are no metres: divide the coord"):
+            view(tmp_path / name, out=tmp_path / "out")
+        assert not (tmp_path / "out").exists()
+
     def test_refuses_what_it_cannot_show(self, tmp_path):
         (tmp_path / "notes.txt").write_text("no scan")
         (tmp_path / "damaged.npz").write_bytes(b"")

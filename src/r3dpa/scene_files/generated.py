@@ -9,10 +9,12 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
 import torch
 from tqdm import tqdm
 
 import r3dpa
+from lidarsim.clouds import check_metres
 from lidarsim.scan_files import read_beside, read_clouds
 from r3dpa import viz
 from r3dpa.checkpoints import Checkpoint, read_snapshot
@@ -128,15 +130,22 @@ def generate_all(
 
 
 def page_scans(source: Path, columns: Sequence[str] = ()) -> list[Callable[[], viz.PageScan]]:
-    """Readers of the scans of a folder or file, in order."""
+    """Readers of the scans of a folder or file, in order.
+
+    They raise a ScanError where :func:`lidarsim.clouds.check_metres` does.
+    """
 
     def read(name: str, path: Path) -> viz.PageScan:
         (points,) = read_clouds(path, columns).values()
+        check_metres(path, points)
         if path.suffix != ".bin":
             return viz.PageScan(name, points)
         return viz.PageScan(name, points, read_beside(path, "labels"), read_beside(path, "origins"))
 
+    def member(name: str, points: np.ndarray) -> viz.PageScan:
+        check_metres(f"{source}: {name}", points)
+        return viz.PageScan(f"{source.stem}/{name}", points)
+
     if source.suffix == ".npz" and source.is_file():
-        clouds = read_clouds(source, columns).items()
-        return [partial(viz.PageScan, f"{source.stem}/{name}", points) for name, points in clouds]
+        return [partial(member, *item) for item in read_clouds(source, columns).items()]
     return [partial(read, scan.name, scan.path) for scan in find_scans(source)]
