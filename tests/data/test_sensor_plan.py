@@ -70,3 +70,13 @@ def test_plan_of_a_sensor_of_sixteen_beams(scans, tmp_path, capsys):
 def test_columns_that_no_stem_can_fold_are_refused(scans):
     with pytest.raises(ValueError, match="columns must be a multiple of 128, got 1000"):
         SensorPlan.of("vlp16", str(scans), 1.0, 1000)
+
+
+def test_scans_of_another_sensor_are_refused(scans):
+    """Of 1808 shots of a beam, 1024 columns have room for 57 %, and beams share rows."""
+    message = (
+        rf"only \d\d% of the points of {scans} come back from range images of the sensor os0_32 "
+        rf"\(32 beams, 1024 columns\), at least 60% .*`r3dpa data sensor {scans} --out mine.yaml`"
+    )
+    with pytest.raises(ValueError, match=message):
+        SensorPlan.of("os0_32", str(scans), 1.0)

@@ -18,7 +18,7 @@ from lidarsim import Simulator
 from lidarsim.sensors import SpinningLidar, load_sensor
 from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.data.scans import evenly
-from r3dpa.geometry import BeamProjection, describe_share_kept
+from r3dpa.geometry import BeamProjection, describe_share_kept, share_kept
 from r3dpa.io import write_text
 
 MOST_SIMULATED, FEWEST_SIMULATED = 2000, 32
@@ -33,6 +33,9 @@ _USER_SHARE = 1 / 3  # of the training scans of an epoch
 _EVERY = 20  # simulated scans of a drive are 2 s apart
 _TIMED_SCANS = 3
 _SCANS_TO_CHECK = 8  # of whose points the share in the image is printed
+# Share of the points that come back from an image with a column per shot: 0.9 and more in scans of
+# the sensor, see notebooks/results/sensors/points_kept.md, mostly half and less of another one.
+_LEAST_KEPT = 0.6
 
 
 class Split(NamedTuple):
@@ -85,7 +88,8 @@ class SensorPlan:
         """Plan for the scans of a folder; simulates a few scans to measure the machine.
 
         Raises:
-            ValueError: If images cannot have so many columns.
+            ValueError: If images cannot have so many columns, or if the scans are of another
+                sensor.
         """
         divisor = _LATENTS[1] * _STRIDE
         if columns % divisor:
@@ -94,12 +98,13 @@ class SensorPlan:
         projection = BeamProjection.for_networks(lidar, columns)
         module = LidarDataModule(scans, sensor=sensor, image_columns=columns, val_every=None)
         all_scans = module.split()[0]
+        checked = evenly(all_scans, _SCANS_TO_CHECK)
+        points = [torch.from_numpy(scan.read(projection.sensor)[:, :3]) for scan in checked]
+        _check_sensor(sensor, lidar, scans, points)
         split = split_of(len(all_scans))
         seconds = _seconds_per_scan(lidar)
         fitting = int(60 * _SIMULATION_SHARE * minutes * workers / seconds)
         num_simulated = min(MOST_SIMULATED, max(FEWEST_SIMULATED, fitting))
-        checked = evenly(all_scans, _SCANS_TO_CHECK)
-        points = [torch.from_numpy(scan.read(projection.sensor)[:, :3]) for scan in checked]
         kept = describe_share_kept(points, projection)
         return cls(sensor, scans, projection, split, kept, seconds, num_simulated, minutes, workers)
 
@@ -219,6 +224,23 @@ def split_of(num_scans: int) -> Split:
     val_every = math.ceil(num_scans / num_held_out)
     num_held_out = len(range(0, num_scans, val_every))
     return Split(num_scans - num_held_out, num_held_out, val_every)
+
+
+def _check_sensor(name: str, lidar: SpinningLidar, scans: str, points: list[torch.Tensor]) -> None:
+    """Refuse scans ``(P, 3)`` of which too few points have a pixel of their own.
+
+    Of each shot of a dual return, one return has.
+    """
+    projection = BeamProjection.of(lidar)
+    share = sum(share_kept(scan, projection) for scan in points) / len(points)
+    least = _LEAST_KEPT / 2 if lidar.return_mode == "dual" else _LEAST_KEPT
+    if share < least:
+        raise ValueError(
+            f"only {share:.0%} of the points of {scans} come back from range images of the sensor "
+            f"{name} ({lidar.num_beams} beams, {lidar.shots} columns), at least {least:.0%} would "
+            f"of its own scans: give the sensor of these, which `r3dpa data sensor {scans} "
+            "--out mine.yaml` estimates"
+        )
 
 
 def _seconds_per_scan(lidar: SpinningLidar) -> float:
