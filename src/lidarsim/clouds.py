@@ -232,6 +232,15 @@ class PointCloud:
         """
         check_metres(self.where, self.points)
 
+    def without_origin(self) -> Self:
+        """Cloud without points at (0, 0, 0), as which drivers write shots without a return."""
+        is_return = self.points.any(axis=1)
+        if is_return.all():
+            return self
+        labels = None if self.labels is None else self.labels[is_return]
+        file = None if self.file is None else self.file._replace(data=None)
+        return replace(self, table=self.table[is_return], labels=labels, file=file)
+
     def describe(self) -> str:
         """Format, columns, number of points, ranges and intensities in one line."""
         names = ", ".join(self.table.dtype.names or ())
@@ -254,9 +263,15 @@ class PointCloud:
 def check_metres(where: str | Path, points: NDArray[np.floating]) -> None:
     """Refuse fewer than 16 points ``(P, 3)`` or more columns, and ranges that cannot be metres.
 
+    Points at (0, 0, 0) do not count.
+
     Raises:
         ScanError: With what to do; ``where`` names the scan.
     """
+    num_all = len(points)
+    points = points[points[:, :3].any(axis=1)]
+    if num_all and not len(points):
+        raise ScanError(f"{where}: all of its {num_all} points are 0; export it again")
     if len(points) < _FEWEST_POINTS:
         raise ScanError(
             f"{where}: holds {len(points)} of at least {_FEWEST_POINTS} points; remove it"

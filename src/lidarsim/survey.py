@@ -20,11 +20,18 @@ _KNOWN_BESIDE = (".label", ".origin", ".json", ".yaml", ".md")
 
 
 def describe_scan(cloud: PointCloud) -> str:
-    """Return format, columns, points, ranges and beams in a line, and a note about the frame."""
-    scan = recorded_scan(cloud)
+    """Return format, columns, points, ranges and beams in a line, and a note about the frame.
+
+    Points at (0, 0, 0) are no returns: their share is said, and they have no beam.
+    """
+    returns = cloud.without_origin()
+    scan = recorded_scan(returns)
     rings = rings_of(scan)
     beams = f"{rings.num_rings} beams by {rings.how}, {rings.sure:.0%} of the points sure"
-    line = f"{cloud.where}: {cloud.describe()}, {beams}"
+    line = f"{cloud.where}: {cloud.describe()}"
+    if len(returns) < len(cloud):
+        line += f", {1 - len(returns) / len(cloud):.1%} of the points at (0, 0, 0)"
+    line += f", {beams}"
     ground = ground_around(scan.points)
     height_m = math.inf if ground is None else float(np.median(ground[:, 2]))
     if abs(height_m) < _VEHICLE_FRAME_M:

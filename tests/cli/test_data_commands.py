@@ -209,6 +209,17 @@ class TestCheck:
         assert status == 0
         assert "skipped files: 2 .csv, 1 .pcd" in lines
 
+    def test_points_at_the_origin_are_counted_and_have_no_beam(self, simulated, tmp_path, capsys):
+        scan = read_scan(next(simulated.rglob("data/*.bin")))
+        scan[::5] = 0
+        write_bin(tmp_path / "a.bin", scan)
+        status, lines = check(tmp_path, capsys)
+        assert status == 0
+        assert (
+            "20.0% of the points at (0, 0, 0), 64 beams by order, 100% of the points sure"
+            in lines[0]
+        )
+
     def test_the_frame_of_a_vehicle_is_noticed(self, simulated, tmp_path, capsys):
         points = read_scan(next(simulated.rglob("data/*.bin")))
         for name, height in (("sensor", 0), ("vehicle", 1.73)):

@@ -182,6 +182,19 @@ def test_unknown_fields_of_packed_rows_do_no_harm(vlp16_scans, tmp_path):
     assert estimate(tmp_path / "packed.npy").sensor.num_beams == 16
 
 
+def test_shots_without_a_return_at_the_origin_are_left_out(vlp16_scans, tmp_path):
+    scans = []
+    for number, rows in enumerate(vlp16_scans):
+        is_lost = np.random.default_rng(number).random(len(rows)) < 0.2
+        scans.append(rows * ~is_lost[:, None])
+        np.save(tmp_path / f"{number}.npy", scans[-1])
+    for source in (scans, tmp_path):
+        estimated = estimate(source)
+        assert (estimated.sensor.num_beams, estimated.beams_by) == (16, "the order")
+        assert estimated.sensor.shots == load_sensor("vlp16").shots
+        assert estimated.sensor.min_range_m > 0.1
+
+
 def test_scans_that_show_no_spinning_sensor_are_refused(vlp16_scans):
     rows, generator = vlp16_scans[0], np.random.default_rng(2)
     with pytest.raises(ValueError, match="10 of at least 16 points"):

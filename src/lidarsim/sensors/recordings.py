@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarsim.clouds import PointCloud, read_cloud, suffix_of
+from lidarsim.clouds import PointCloud, check_metres, read_cloud, suffix_of
 from lidarsim.recorded import RecordedScan
 from lidarsim.rings import Rings, rings_of
 from lidarsim.scan_files import ScanError
@@ -70,10 +70,8 @@ def read_scan_of(scan: Any, number: int) -> SensorScan:
             cloud = PointCloud.of(array[row, column, :3], ring=row)
         else:
             cloud = PointCloud.of(array)
-    is_zero = ~cloud.points.any(axis=1)
-    if is_zero.all():
-        raise ScanError(f"{name}: all of its {len(cloud)} points are 0; export it again")
-    cloud.check_metres()
+    check_metres(name, cloud.points)
+    cloud = cloud.without_origin()
     _check_upright(name, cloud.points)
     usable = column is not None and shape is not None and len(column) == len(cloud)
     return SensorScan(
