@@ -330,7 +330,7 @@ def read_cloud(
             num_bad = np.count_nonzero(~finite)
             raise ScanError(
                 f"{path}: has NaN or infinite values in {num_bad} of {len(table)} points; "
-                "--drop_nan leaves them out"
+                "`r3dpa data convert SCANS OUT --to bin --drop_nan true` leaves them out"
             )
         table, labels = table[finite], None if labels is None else labels[finite]
     file = CloudFile(path, kind, pack, data if finite is None else None, label_path)

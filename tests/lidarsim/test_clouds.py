@@ -203,7 +203,10 @@ BAD = {
     ),
     "negative.bin": (ZERO.astype("f4").tobytes(), "name the columns with --columns"),
     "one.bin": (ROWS[:1, :4].tobytes(), "holds 1 of at least 16 points; remove it"),
-    "nan.bin": (NAN.tobytes(), "NaN or infinite values in 1 of 40 points; --drop_nan"),
+    "nan.bin": (
+        NAN.tobytes(),
+        "NaN or infinite values in 1 of 40 points; `r3dpa data convert SCANS OUT --to bin --drop",
+    ),
     "far.bin": ((ROWS[:, :4] * 100).tobytes(), "which are no metres: divide"),
     "near.bin": ((ROWS[:, :4] / 100).tobytes(), "which are no metres: multiply"),
     "scan.csv": (b"1,2,3", "is of no known format; can be read: .bin"),

@@ -93,3 +93,14 @@ def test_targets_that_cannot_be_written_are_refused_before_anything_is(folder, p
     with pytest.raises(ScanError, match=r"1\.bin: has no column ring, and only \d+% of its points"):
         convert(folder / "b", out, "--to", "pcd.bin")
     assert not out.exists()
+
+
+def test_the_command_that_is_advised_for_nan_leaves_them_out(points, tmp_path):
+    rows = points.copy()
+    rows[3, 2] = np.nan
+    (tmp_path / "a.bin").write_bytes(rows.tobytes())
+    with pytest.raises(ScanError, match=r"`r3dpa data convert SCANS OUT .*` leaves") as raised:
+        read_scan(tmp_path / "a.bin")
+    options = str(raised.value).split("`")[1].partition("SCANS OUT")[2].split()
+    convert(tmp_path / "a.bin", tmp_path / "out", *options)
+    assert np.array_equal(read_scan(tmp_path / "out/a.bin"), np.delete(points, 3, axis=0))
