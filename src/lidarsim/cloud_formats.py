@@ -84,7 +84,9 @@ def unreadable(path: Path, error: OSError) -> ScanError:
 
 
 def _refuse_devices(path: Path) -> None:
-    """Refuse pipes, which would be waited for, and devices, which may never end."""
+    """Refuse folders, pipes, which would be waited for, and devices, which may never end."""
+    if path.is_dir():
+        raise ScanError(f"{path}: is a folder; give one scan")
     if path.exists() and not path.is_file():
         raise ScanError(f"{path}: is no regular file")
 

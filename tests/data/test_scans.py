@@ -163,6 +163,13 @@ def test_broken_scan_is_named_with_its_reason(tmp_path, data, reason):
             np.fromfile(file, np.float32).reshape(-1, 4)
 
 
+def test_a_folder_in_place_of_a_scan_is_said_to_be_one(tmp_path):
+    for read, name in ((read_scan, "a.bin"), (read_npz, "b.npz")):
+        (tmp_path / name).mkdir()
+        with pytest.raises(ScanError, match=rf"{name}: is a folder; give one scan$"):
+            read(tmp_path / name)
+
+
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no named pipes")
 def test_pipes_and_devices_are_not_read(tmp_path):
     """A pipe would be waited for, and a device may never end."""

@@ -209,6 +209,8 @@ def test_files_of_something_else_are_named(tmp_path):
             path.write_bytes(content)
         with pytest.raises(ValueError, match=r"a\.safetensors holds no reference statistics"):
             ReferenceStatistics.load(path)
+    with pytest.raises(ValueError, match="is a folder; give the file that `r3dpa data reference`"):
+        ReferenceStatistics.load(tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -210,6 +210,8 @@ class ReferenceStatistics:
         Raises:
             ValueError: Naming the file and the fault.
         """
+        if Path(path).is_dir():
+            raise ValueError(f"{path} is a folder; give the file that `r3dpa data reference` wrote")
         try:
             with safe_open(path, framework="pt") as file:
                 card = json.loads(file.metadata()[_ABOUT])
