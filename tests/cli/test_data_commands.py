@@ -57,6 +57,14 @@ class TestSensors:
             main(["sensor", str(tmp_path / "scan.bin"), "--out", str(tmp_path / "mine.yaml")])
         assert [path.name for path in tmp_path.iterdir()] == ["scan.bin"]
 
+    @pytest.mark.parametrize("name", ["mine.yaml", "mine.png"])
+    def test_an_existing_file_is_not_replaced(self, name, tmp_path):
+        (tmp_path / name).write_text("mine")
+        with pytest.raises(ValueError, match=rf"{name} exists: delete it, or give another --out$"):
+            main(["sensor", str(tmp_path), "--out", str(tmp_path / "mine.yaml")])
+        assert [path.name for path in tmp_path.iterdir()] == [name]
+        assert (tmp_path / name).read_text() == "mine"
+
 
 class TestSimulate:
     """One small scan each; what is asked for is recorded in the manifest."""

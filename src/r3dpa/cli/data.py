@@ -211,12 +211,16 @@ def sensor(scans: Path, *, out: Path, num: PositiveInt = 30) -> str:
 
     Args:
         scans: A scan of any format that can be read, or a folder of scans of one sensor.
-        out: File to write, ``.yaml``.
+        out: File to write, ``.yaml``; neither it nor the picture may exist.
         num: Maximum number of scans, evenly spaced.
     """
     check_file(out)
     if out.suffix not in (".yaml", ".yml"):
         raise ValueError(f"--out must be a .yaml file, got {out}")
+    picture = out.with_suffix(".png")
+    for file in (out, picture):
+        if file.exists():
+            raise ValueError(f"{file} exists: delete it, or give another --out")
     import numpy as np
     import torch
 
@@ -230,7 +234,7 @@ def sensor(scans: Path, *, out: Path, num: PositiveInt = 30) -> str:
     files = evenly(find_files(scans)[1], num)
     estimated = estimate(files)
     estimated.save(out)
-    picture = viz.save(viz.beam_residuals(estimated), out.with_suffix(".png"))
+    viz.save(viz.beam_residuals(estimated), picture)
     table = text_table(estimated.rows(), ["quantity", "value", "confidence"], "llr", "plain")
     notes = [f"note: {note}" for note in (*estimated.notes, _FRAME_NOTE)]
     checked = evenly(files, _SCANS_TO_CHECK)
