@@ -132,7 +132,7 @@ class TestWeather:
         head += [f"property float {name}" for name, _ in names] + ["end_header", rows, ""]
         source = tmp_path / "a.ply"
         source.write_text("\n".join(head))
-        weather(source, tmp_path / "out", "--show", 0)
+        weather(source, tmp_path / "out", "--show", 0, "--weather.sun_elevation_deg", -20)
         assert (tmp_path / "out/a.ply").read_bytes() == source.read_bytes()
 
 
@@ -282,6 +282,8 @@ def test_a_scan_without_a_point_left_is_not_written(folder, tmp_path):
 
 
 BAD = {
+    "none": ([], "give an option such as --weather.visibility_m 60 or --weather.rain_mm_h 10"),
+    "none on": (["--effects.range_noise", "off"], "no weather is given, so that scans would stay"),
     "visibility": (["--weather.visibility_m", "0"], "visibility_m must be 1 or greater"),
     "negative": (["--weather.visibility_m", "-5"], "visibility_m must be 1 or greater"),
     "rain": (["--weather.rain_mm_h", "10000"], "rain_mm_h must be at most"),

@@ -40,6 +40,11 @@ def weather(
         effects: ``off`` or ``on`` by effect, such as ``--effects.range_noise on``.
         **options: See :class:`FolderOptions`.
     """
+    if weather == Weather() and not any(on in ("on", True) for on in (effects or {}).values()):
+        raise ValueError(
+            "no weather is given, so that scans would stay as they are: give an option such as "
+            "--weather.visibility_m 60 or --weather.rain_mm_h 10"
+        )
     change = partial(weather.apply, instrument=instrument, effects=effects)
     # An error in the request must not be reported as one in the first scan.
     change(RecordedScan(np.ones((1, 3), np.float32)), 0)
