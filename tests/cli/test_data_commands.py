@@ -155,14 +155,16 @@ def test_check_says_the_columns_and_beams_of_other_formats(tmp_path, capsys):
     np.save(tmp_path / "a.npy", np.array(rows, "f4"))
     (tmp_path / "a.pcd.bin").write_bytes(np.array(rows, "f4").tobytes())
     status, lines = check(tmp_path, capsys)
-    assert (status, len(lines)) == (0, 2)
-    for line in lines:
+    assert (status, len(lines)) == (0, 3)
+    assert lines[-1] == f"{tmp_path}: 2 scans, all usable"
+    for line in lines[:2]:
         assert "(x, y, z, intensity, ring), 300 points, range 5..5.385, intensity 0.5..0.5" in line
         assert line.endswith("3 beams by stored, 100% of the points sure")
     np.save(tmp_path / "b.npy", np.array(rows, "f4") * 100)
     status, lines = check(tmp_path, capsys)
     assert status == 1
     assert lines[2].startswith(f"bad: {tmp_path / 'b.npy'}: ranges have the median")
+    assert lines[-1] == f"{tmp_path}: 3 scans, problems: 1"
 
 
 class TestCheck:
@@ -206,6 +208,8 @@ class TestCheck:
         assert status == 1
         assert lines[0].startswith("bad: ")
         assert says in lines[0]
+        assert not any("missing: " in line or "skipped " in line for line in lines)
+        assert name == "gone" or re.search(r": [01] scans?, problems: 1$", lines[-1])
 
     def test_skipped_files_are_counted(self, simulated, tmp_path, capsys):
         scan = next(simulated.rglob("data/*.bin"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -37,19 +38,17 @@ def check(folder: Path, *, columns: tuple[str, ...] = ()) -> None:
         sys.exit(1)
     from lidarsim.scan_files import ScanError
     from lidarsim.survey import describe_scan, skipped_files
-    from r3dpa.data.scans import RAW, evenly, scan_files
+    from r3dpa.data.scans import RAW, evenly, scan_files, verdict
     from r3dpa.data.scans import check as check_scans
 
     is_layout = (folder / RAW).is_dir()
     files = list(scan_files(folder))
     kitti = [file for file in sorted(files) if suffix_of(file) == ".bin" and not columns]
     lines: list[str] = []
-    text, others, usable = "", list[Path](), True
+    others: list[Path] = []
     if not kitti and not is_layout:
-        try:
+        with suppress(ScanError):  # which check_scans says
             others = find_files(folder)[1]
-        except ScanError as error:
-            lines.append(f"bad: {error}")
     errors: dict[Path, ScanError] = {}
     for file in others or evenly(kitti, 4):
         try:
@@ -60,12 +59,13 @@ def check(folder: Path, *, columns: tuple[str, ...] = ()) -> None:
             errors[file.resolve()] = error
             lines += [f"bad: {error}"] if others else []
     if others:
-        usable = not errors
+        text, usable = f"{folder.absolute()}: {verdict(len(others), len(errors))}", not errors
     else:
         text, usable = check_scans(folder, errors)
-    if not is_layout and (line := skipped_files(files_below(folder), others or kitti)):
+    is_plain = not is_layout and bool(others or kitti)
+    if is_plain and (line := skipped_files(files_below(folder), others or kitti)):
         lines.append(line)
-    sys.stdout.write("\n".join([*lines, *([text] if text else []), ""]))
+    sys.stdout.write("\n".join([*lines, text, ""]))
     if not usable:
         sys.exit(1)
 

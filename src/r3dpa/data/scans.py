@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from lidarsim import TRAIN_DRIVES, VAL_DRIVES, drive_name, expected_scans
 from lidarsim.cloud_formats import READABLE, READERS, ScanError, unreadable
-from lidarsim.clouds import files_below, read_cloud, suffix_of
+from lidarsim.clouds import files_below, find_files, read_cloud, suffix_of
 from lidarsim.scan_files import read_scan, rows_of
 from r3dpa.data.store import ItemKey
 from r3dpa.geometry import LidarSensor
@@ -30,6 +30,8 @@ KITTI360_DRIVES: dict[Split, tuple[str, ...]] = {
     "val": tuple(drive_name(number) for number in VAL_DRIVES),
 }
 RAW = "data_3d_raw"
+# Beginnings of the names of folders beside ``RAW`` or in it.
+_KITTI360_NAMES = ("data_2d_", "data_3d_", "data_poses", "2013_05_28_drive_")
 VELODYNE = Path("velodyne_points") / "data"
 
 
@@ -186,8 +188,8 @@ def _drive_name(folder: Path, root: Path) -> str:
 def check(path: str | Path, further: Mapping[Path, ScanError] | None = None) -> tuple[str, bool]:
     """Text about every scan of a data set, folder or file, and whether nothing is wrong with it.
 
-    A folder with ``data_3d_raw``, or without any scan, is compared with the KITTI-360 layout and
-    its nine LiDAR drives; a simulated one with its manifest (``ValueError`` if that is damaged).
+    A folder with folders of KITTI-360 is compared with its layout and nine LiDAR drives; a
+    simulated one with its manifest (``ValueError`` if that is damaged).
     Every scan needs 16 points, ranges in metres, and a point within the range limits of
     :class:`LidarSensor`. ``further`` are errors of scans by their resolved path, which are listed
     where nothing else is wrong with the scan.
@@ -196,6 +198,11 @@ def check(path: str | Path, further: Mapping[Path, ScanError] | None = None) -> 
     scans = find_scans(root) if any(scan_files(root)) else []
     counts = dict(sorted(Counter(scan.drive for scan in scans).items()))
     problems = _compare_layout(root, counts)
+    if not scans and not problems:
+        try:
+            find_files(root)
+        except ScanError as error:
+            problems.append(f"bad: {error}")
 
     def examine(scan: Scan) -> tuple[float, float] | str:
         try:
@@ -216,12 +223,19 @@ def check(path: str | Path, further: Mapping[Path, ScanError] | None = None) -> 
         low, high = min(low for low, _ in limits), max(high for _, high in limits)
         outside = " (expected 0..1)" if low < 0 or high > 1 else ""
         lines.append(f"intensity: {low:.3g}..{high:.3g}{outside}")
-    verdict = f"problems: {len(problems)}" if problems else "all usable"
-    scans_text = f"{len(scans)} scan{'s' * (len(scans) != 1)}"
-    lines.append(
-        f"{root}: {scans_text} in {len(counts)} drive{'s' * (len(counts) != 1)}, {verdict}"
-    )
+    in_drives = f" in {_number_of(len(counts), 'drive')}" if scans else ""
+    lines.append(f"{root}: {verdict(len(scans), len(problems), in_drives)}")
     return "\n".join(lines), not problems
+
+
+def verdict(num_scans: int, num_problems: int, place: str = "") -> str:
+    """Return how many scans were checked, and whether they can be used."""
+    usable = f"problems: {num_problems}" if num_problems else "all usable"
+    return f"{_number_of(num_scans, 'scan')}{place}, {usable}"
+
+
+def _number_of(num: int, noun: str) -> str:
+    return f"{num} {noun}" if num == 1 else f"{num} {noun}s"
 
 
 def _compare_layout(root: Path, counts: dict[str, int]) -> list[str]:
@@ -229,7 +243,9 @@ def _compare_layout(root: Path, counts: dict[str, int]) -> list[str]:
     if not root.exists():
         return [f"missing: {root}"]
     if not raw.is_dir():
-        return [] if counts and simulated is None else [f"missing: {raw}"]
+        is_layout = any(path.name.startswith(_KITTI360_NAMES) for path in root.glob("*"))
+        is_expected = simulated is not None or (is_layout and not counts)
+        return [f"missing: {raw}"] if is_expected else []
     problems = []
     official = dict.fromkeys(KITTI360_DRIVES["train"] + KITTI360_DRIVES["val"], 1)
     for drive, expected in sorted((simulated or official).items()):
