@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from contextlib import suppress
 from typing import Literal, NamedTuple
 
@@ -24,6 +25,9 @@ _LARGE_STEP_RAD = math.radians(5)
 # A first pass has at least this many rings, and this share of its steps in one direction.
 _FEWEST_RINGS, _ONE_WAY = 4, 0.9
 _LEAP = 0.2  # over this share of the field of view
+# Steps of inclination from ring to ring, as shares of the mean pitch; azimuths at which rings may
+# start, of which the likeliest are tried.
+_LEAST_STEP, _MOST_STEP, _SEAM_BINS, _MOST_SEAMS = 0.3, 3.0, 360, 12
 # Median step of inclination along stored rings, over the standard deviation of all: at most 0.01 in
 # scans of three sensors, in the frame of the vehicle too, and at least 0.4 in rings by chance.
 _MOST_STEP_SHARE = 0.25
@@ -47,7 +51,8 @@ def rings_of(scan: RecordedScan) -> Rings:
         The column of the file. All points are sure; none is if there are more than 256 rings, or
         if points of a ring with almost the same azimuth have unrelated inclinations.
     ``order``
-        Files that hold ring after ring: a ring ends where the azimuth wraps, in either direction.
+        Files that hold ring after ring: a ring ends where the azimuth wraps, in either direction,
+        at azimuth 0 or where the rings of the file start.
         Points that follow their predecessor by at most 5 degrees are sure. Points after the last
         ring, such as those that weather adds, have the ring of the nearest inclination.
     ``inclination``
@@ -91,7 +96,7 @@ def _in_order(
     sensor = LidarSensor(_MOST_BEAMS // 2, **limits)
     for turned in (azimuth, -azimuth % (2 * np.pi)):
         with suppress(ValueError):
-            ring = rings_in_order(inclination, turned, sensor)[0]
+            ring, turned = _from_seam(inclination, turned, sensor)
             num_first = _first_pass(ring, inclination)
             step = np.diff(turned[:num_first])[np.diff(ring[:num_first]) == 0]
             sure = float((np.abs(step) < _LARGE_STEP_RAD).mean()) if len(step) else 0.0
@@ -101,6 +106,45 @@ def _in_order(
                 sure *= num_first / len(ring)
             return ring, "order", sure
     return None
+
+
+def _from_seam(
+    inclination: NDArray[np.float64], azimuth: NDArray[np.float64], sensor: LidarSensor
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Rings ``(P,)`` from the wraps of the azimuth, and the azimuth from where rings start.
+
+    A cut at another azimuth splits the first ring and the last one, so that there is one ring more.
+    """
+    ring, num_rings = rings_in_order(inclination, azimuth, sensor)
+    pitch = float(np.ptp(np.quantile(inclination, [0.001, 0.999]))) / num_rings
+    at_wraps = np.diff(inclination)[np.diff(ring) != 0]
+    if len(at_wraps) and abs(np.median(at_wraps)) < _LEAST_STEP * pitch:
+        for seam in _likely_seams(inclination, azimuth, pitch):
+            from_seam = (azimuth - seam) % (2 * np.pi)
+            with suppress(ValueError):
+                other, num_other = rings_in_order(inclination, from_seam, sensor)
+                if num_other < num_rings:
+                    return other, from_seam
+    return ring, azimuth
+
+
+def _likely_seams(
+    inclination: NDArray[np.float64], azimuth: NDArray[np.float64], pitch: float
+) -> Iterator[float]:
+    """Yield azimuths at which many rings may end, radians, the likeliest first.
+
+    There the inclination steps by about the pitch, all over the scan in one direction.
+    """
+    step, turn = np.diff(inclination), np.diff(azimuth)
+    is_step = (np.abs(step) > _LEAST_STEP * pitch) & (np.abs(step) < _MOST_STEP * pitch)
+    is_step &= np.abs(turn) < 2 * np.pi / _SEAM_BINS
+    sign, middle = np.sign(step[is_step]), (azimuth[:-1] + turn / 2)[is_step]
+    place = (middle / (2 * np.pi) * _SEAM_BINS).astype(np.int64) % _SEAM_BINS
+    balance = np.bincount(place, sign, _SEAM_BINS)
+    for likely in np.argsort(-np.abs(balance))[:_MOST_SEAMS]:
+        is_here = (place == likely) & (sign == np.sign(balance[likely]))
+        if is_here.any():
+            yield float(np.median(middle[is_here]))
 
 
 def _first_pass(ring: NDArray[np.int64], inclination: NDArray[np.float64]) -> int:

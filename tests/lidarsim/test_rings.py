@@ -31,6 +31,17 @@ def test_rings_by_the_order_of_the_file_in_any_direction(model, beams):
         assert found.sure > 0.98
 
 
+@pytest.mark.parametrize("turn_deg", [40, 90, 200, 300])
+@pytest.mark.parametrize("way", [1, -1])
+def test_rings_may_start_at_any_azimuth(turn_deg, way):
+    points, ring = simulated("hdl64e", 520)
+    cosine, sine = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
+    turn = np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]], np.float32)
+    found = rings_of(RecordedScan((points @ turn)[::way].copy()))
+    assert (found.how, found.num_rings) == ("order", 64)
+    assert (found.ring[::way] == ring).mean() > 0.99
+
+
 def test_rings_of_a_shuffled_scan_are_fitted_and_those_stored_are_used():
     points, ring = simulated("hdl32e", 520)
     order = np.random.default_rng(0).permutation(len(points))
