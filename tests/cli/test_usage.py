@@ -306,10 +306,10 @@ def test_a_fit_logs_its_configuration_to_wandb(fitted):
     assert b"r3dpa.modules.VAEAlignment" in content
 
 
-def test_a_fit_that_is_refused_leaves_no_wandb_run(smoke_args, tmp_path):
+def test_a_fit_that_is_refused_leaves_no_configuration_and_no_wandb_run(smoke_args, tmp_path):
     words = smoke_args("vae_alignment", tmp_path, "--data.init_args.grid_size=[4, 16]")
     words += [f"--trainer.logger={json.dumps([WANDB])}", "--trainer.callbacks=[]"]
     with pytest.raises(ValueError, match=r"set --data\.init_args\.grid_size to the latter"):
         main(words)
-    assert (tmp_path / "config.yaml").is_file()
+    assert not (tmp_path / "config.yaml").exists()
     assert not (tmp_path / "wandb").exists()

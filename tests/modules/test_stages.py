@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -153,6 +154,17 @@ def test_a_second_fit_does_not_mix_with_the_first(joint_run, smoke_args):
     with pytest.raises(ValueError, match=r"holds an earlier run.*--ckpt_path"):
         main(smoke_args("joint", joint_run, *QUICK))
     assert (joint_run / "checkpoints" / "last.ckpt").read_bytes() == before
+
+
+def test_a_refused_resume_keeps_the_configuration_of_the_run(joint_run, smoke_args, tmp_path):
+    """Weights of another width are refused only where Lightning loads them."""
+    shutil.copytree(joint_run, tmp_path / "run")
+    before = (tmp_path / "run" / "config.yaml").read_text()
+    for option in ("in_channels=8", "projector_dim=24"):
+        words = [*QUICK, "--ckpt_path=last", f"--model.init_args.sit.init_args.{option}"]
+        with pytest.raises((ValueError, RuntimeError), match=r"in_channels|size mismatch"):
+            main(smoke_args("joint", tmp_path / "run", *words))
+        assert (tmp_path / "run" / "config.yaml").read_text() == before
 
 
 def test_resuming_keeps_the_given_settings(joint_run, smoke_args, tmp_path):

@@ -129,8 +129,8 @@ class _LossBar(TQDMProgressBar):
 class _RecordConfig(SaveConfigCallback):
     """Write the configuration of a training to ``run_dir`` and to wandb.
 
-    A wandb run begins with the first step: what data, networks and earlier checkpoints refuse
-    before that leaves no run behind.
+    Both begin with the first step: what data, networks and earlier checkpoints refuse before that
+    replaces no configuration and leaves no wandb run behind.
     """
 
     started = False
@@ -142,8 +142,7 @@ class _RecordConfig(SaveConfigCallback):
         trainer.loggers = [logger for logger in self.loggers if not isinstance(logger, WandbLogger)]
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        if stage == "fit":  # evaluating a run does not replace its configuration
-            super().setup(trainer, pl_module, stage)
+        """Write nothing yet: what is refused later must not replace the file of an earlier run."""
 
     def save_config(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Write the configuration; not to ``trainer.log_dir``, which would need all processes."""
@@ -151,7 +150,12 @@ class _RecordConfig(SaveConfigCallback):
         write_text(Path(trainer.default_root_dir) / self.config_filename, text)
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Give the wandb loggers back, with the arguments of the module and the configuration."""
+        """Write the configuration, and give the wandb loggers back with it.
+
+        They also get the arguments of the module.
+        """
+        if trainer.is_global_zero:
+            self.save_config(trainer, pl_module, "fit")
         if not self.loggers:
             return
         trainer.loggers = list(self.loggers)
