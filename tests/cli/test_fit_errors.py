@@ -7,10 +7,11 @@ from __future__ import annotations
 
 from functools import partial
 
+import lightning as L
 import numpy as np
 import pytest
 import torch
-from tiny_stages import TinyData, stage_module, tiny_sit, train
+from tiny_stages import SILENT, TinyData, stage_module, tiny_sit, train
 
 from r3dpa.cli import main
 
@@ -95,10 +96,50 @@ def test_networks_and_data_that_do_not_fit(data, sit, message):
         train(stage_module("joint", partial(tiny_sit, **sit)), given)
 
 
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--trainer.precision=64-true", "--trainer.precision 64-true is not supported"),
+        (
+            "--trainer.max_steps=-1 --model.init_args.optimizer.decay_steps=2",
+            "optimizer.decay_steps and optimizer.cosine need the last step",
+        ),
+        (f"--{SIT}.in_channels=8", "has in_channels 8, but the VAE has 4 latent channels"),
+        (f"--{SIT}.input_size=[4,8]", "but the SiT has input_size (4, 8)"),
+        ("--data.init_args.codec.return_channel=true", "the VAE is for images with"),
+        ("--data.init_args.grid_size=[4,32]", "set --data.init_args.grid_size to the latter"),
+        (
+            "--data.init_args.grid_size=[3,16]",
+            "set --data.init_args.grid_size, or beams and columns of --data.init_args.sensor",
+        ),
+        (f"--{SIT}.feature_dim=20", "features have width"),
+    ],
+)
+def test_a_mistake_is_reported_before_scans_are_simulated(words, message, tmp_path, refused):
+    root = f"--data.init_args.root={tmp_path / 'scans'}"
+    assert message in refused("joint", root, *words.split())
+    assert not (tmp_path / "scans").exists()
+
+
+def test_rings_are_checked_before_their_inclinations_are_known(tmp_path, refused):
+    more = ["--data.init_args.projection=rings", "--data.init_args.grid_size=[4,32]"]
+    message = refused("joint", f"--data.init_args.root={tmp_path / 'scans'}", *more)
+    assert "set --data.init_args.grid_size to the latter" in message
+    assert not (tmp_path / "scans").exists()
+
+
+def test_a_fit_in_python_is_told_to_give_a_datamodule():
+    trainer = L.Trainer(**SILENT, max_steps=1)
+    with pytest.raises(ValueError, match=r"in Python, give trainer\.fit a datamodule"):
+        trainer.fit(stage_module("joint"), train_dataloaders=TinyData().train_dataloader())
+
+
 class TestCheckpoints:
-    def test_resuming_the_checkpoint_of_another_stage(self, vae_checkpoint, refused):
-        message = refused("joint", "--ckpt_path", vae_checkpoint)
+    def test_resuming_the_checkpoint_of_another_stage(self, vae_checkpoint, tmp_path, refused):
+        root = f"--data.init_args.root={tmp_path / 'scans'}"
+        message = refused("joint", root, "--ckpt_path", vae_checkpoint)
         assert "is of stage 'vae_alignment', this is 'joint'" in message
+        assert not (tmp_path / "scans").exists()
 
     def test_a_url_or_a_setting_makes_none_run_code(self, smoke_args, tmp_path):
         class Evil:
@@ -119,10 +160,14 @@ class TestCheckpoints:
         ("stage", "option"),
         [("vae_alignment", "--ckpt_path"), ("joint", "--model.init_args.init_from")],
     )
-    def test_range_images_of_another_encoding(self, stage, option, vae_checkpoint, refused):
-        """A checkpoint knows the range images it was trained on."""
+    def test_range_images_of_another_encoding(
+        self, stage, option, vae_checkpoint, tmp_path, refused
+    ):
+        """A checkpoint knows the range images it was trained on; no scan is needed to compare."""
         other = "--data.init_args.codec={encoding: log2}"
-        message = refused(stage, other, option, vae_checkpoint)
+        root = f"--data.init_args.root={tmp_path / 'scans'}"
+        message = refused(stage, root, other, option, vae_checkpoint)
+        assert not (tmp_path / "scans").exists()
         assert "encoding='linear'" in message
         assert "encoding='log2'" in message
         assert stage == "vae_alignment" or str(vae_checkpoint) in message

@@ -9,6 +9,7 @@ import uuid
 import warnings
 from collections.abc import Sequence
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -22,11 +23,12 @@ from lightning.pytorch.utilities import rank_zero_info, rank_zero_only
 
 from r3dpa.bench.dry_run import DryRun, batch_lines
 from r3dpa.callbacks import RunCheckpoint, SceneScorer
-from r3dpa.checkpoints import read_checkpoint
+from r3dpa.checkpoints import Checkpoint, read_checkpoint
 from r3dpa.cli.parser import Parser
 from r3dpa.cli.presets import expand_preset, find_configs
 from r3dpa.io import delete_unfinished, only_writer, source_commit, write_text
 from r3dpa.modules import GenerativeModule
+from r3dpa.modules.stage import Stage
 
 # What a user can do nothing about, or what is intended: averages and frozen networks stay in
 # evaluation mode, feature grids go to disk, a process may have no scan, the means of held-out scans
@@ -189,7 +191,7 @@ class StageCLI(LightningCLI):
         self, args: list[str], preset: str | None = None, *, dry_run: bool = False
     ) -> None:
         self._command, self._preset, self._dry_run = args[0], preset, dry_run
-        self._ckpt_step: int | None = None
+        self._resumed: Checkpoint | None = None  # without its weights
         super().__init__(
             LightningModule,
             LightningDataModule,
@@ -238,7 +240,7 @@ class StageCLI(LightningCLI):
         if config.get("ckpt_path") == "last":
             config.ckpt_path = _newest(Path(config.run_dir))
         if config.get("ckpt_path"):
-            self._ckpt_step = read_checkpoint(config.ckpt_path).step
+            self._resumed = replace(read_checkpoint(config.ckpt_path), networks={})
             if Path(config.ckpt_path).suffix != ".ckpt":  # released or exported
                 raise ValueError(
                     f"--ckpt_path {config.ckpt_path} is no .ckpt of a run; scenes of other files "
@@ -268,9 +270,10 @@ class StageCLI(LightningCLI):
             super()._run_subcommand(subcommand)
 
     def before_fit(self) -> None:
-        """Load the stage before: mismatches are reported before hours of data preparation."""
-        if isinstance(self.model, GenerativeModule) and self._ckpt_path is None:
-            self.model.load_previous_stage()
+        """Check settings and load the stage before, ahead of hours of data preparation."""
+        if isinstance(self.model, Stage):
+            self.model.check_before_data(self.trainer, self.datamodule, self._resumed)
+        if isinstance(self.model, GenerativeModule) and self._resumed is None:
             option, consequence = _WITHOUT_WEIGHTS.get(self.model.stage, ("", ""))
             if option and getattr(self.model, option) is None and self.model.init_from is None:
                 rank_zero_info(f"without --model.init_args.{option} {consequence}")
@@ -299,7 +302,8 @@ class StageCLI(LightningCLI):
     def before_validate(self) -> None:
         """Refuse random weights, and log at the step of the checkpoint, not at 0."""
         self.before_predict()
-        self.trainer.fit_loop.epoch_loop._batches_that_stepped = self._ckpt_step or 0
+        step = 0 if self._resumed is None else self._resumed.step
+        self.trainer.fit_loop.epoch_loop._batches_that_stepped = step or 0
 
     before_test = before_validate
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any, Literal, cast
 
+import lightning as L
 import torch
 from lightning.pytorch.utilities import rank_zero_info
 from torch import Tensor
@@ -25,13 +26,18 @@ from r3dpa.data.datasets import LidarBatch
 from r3dpa.flow import Interpolant, PerturbedAttention
 from r3dpa.flow.sampler import SamplerConfig
 from r3dpa.generation import SceneGenerator
-from r3dpa.geometry import RangeCodec, ScanGeometry
+from r3dpa.geometry import ScanGeometry
 from r3dpa.io import text_table
+from r3dpa.modules.checks import (
+    check_image,
+    check_latents,
+    check_planned_images,
+    planned_geometry,
+)
 from r3dpa.modules.settings import LossWeights, OptimizerConfig, PathName, TimeSampling
 from r3dpa.modules.stage import (
     PathDraws,
     Stage,
-    check_latents,
     frozen,
     networks_as_settings,
     zero_loss,
@@ -151,6 +157,25 @@ class GenerativeModule(Stage):
         ``geometry`` after its own setup.
         """
         datamodule, geometry = self.attach_scans()
+        self.check_data(datamodule, geometry, stage)
+        if stage != "predict":
+            self.feature_source = getattr(datamodule, "feature_source", None)
+
+    def check_before_data(
+        self, trainer: L.Trainer, datamodule: L.LightningDataModule, resumed: Checkpoint | None
+    ) -> None:
+        """Check trainer, networks and checkpoints, and load the stage before of a new run."""
+        super().check_before_data(trainer, datamodule, resumed)
+        planned = planned_geometry(datamodule)
+        if planned is not None:
+            self.check_data(datamodule, planned, "fit")
+        if resumed is None:
+            self.load_previous_stage()
+            if planned is not None and self._previous_geometry is not None:
+                check_planned_images(planned, self._previous_geometry, str(self.init_from))
+
+    def check_data(self, datamodule: object, geometry: ScanGeometry, stage: str) -> None:
+        """Refuse data that the networks are not made for, by their geometry and settings."""
         sensor = geometry.projection.sensor
         if geometry.codec.reflectance:
             raise ValueError(
@@ -159,10 +184,8 @@ class GenerativeModule(Stage):
             )
         check_image(self.vae, geometry.codec)
         check_latents(self.vae, self.sit, (sensor.beams, sensor.columns))
-        if stage != "predict":
-            self.feature_source = getattr(datamodule, "feature_source", None)
-            if self.needs_features():
-                self._check_features(geometry, datamodule)
+        if stage != "predict" and self.needs_features():
+            self._check_features(geometry, datamodule)
 
     def _check_features(self, geometry: ScanGeometry, datamodule: object) -> None:
         """Refuse data without feature grids, or with grids of another size than the network's."""
@@ -196,7 +219,7 @@ class GenerativeModule(Stage):
     def load_previous_stage(self) -> None:
         """Load ``rgb_weights`` and ``init_from``, and restart the EMA from the loaded weights.
 
-        A fit calls it; call it earlier to report mismatches early.
+        A fit calls it, and :meth:`check_before_data`.
         """
         if self.rgb_weights is not None:
             if not isinstance(self.sit, SiT):
@@ -449,16 +472,3 @@ class GenerativeModule(Stage):
 def _table(rows: Sequence[TransferRow]) -> str:
     heads = ("weights", "tensors", "result", "reason")
     return text_table([tuple(map(str, row)) for row in rows], heads)
-
-
-def check_image(vae: VAE, codec: RangeCodec) -> None:
-    """Refuse a VAE of other images than a codec encodes."""
-    of_vae = (vae.image_channels, vae.intensity, vae.num_classes)
-    of_codec = (codec.channels, codec.intensity_channel, codec.num_classes)
-    if of_vae != of_codec:
-        text = "channels {}, intensity {}, num_classes {}"
-        raise ValueError(
-            f"the VAE is for images with {text.format(*of_vae)}, but --data.init_args.codec gives "
-            f"{text.format(*of_codec)}: "
-            "set in_channels, intensity and num_classes of --model.init_args.vae to the latter"
-        )

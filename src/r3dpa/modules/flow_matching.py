@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.data.datasets import LidarBatch
 from r3dpa.data.posterior_cache import cache_posteriors
+from r3dpa.geometry import ScanGeometry
 from r3dpa.modules.base import GenerativeModule
 from r3dpa.modules.settings import LossWeights
 from r3dpa.modules.stage import PathDraws
@@ -87,18 +88,17 @@ class FlowMatching(GenerativeModule):
                 "gave none: let --model.init_args.init_networks name latent_norm beside vae"
             )
 
-    def setup(self, stage: str) -> None:
+    def check_data(self, datamodule: object, geometry: ScanGeometry, stage: str) -> None:
         """Check data against networks, and whether posteriors of the data can be cached."""
-        super().setup(stage)
+        super().check_data(datamodule, geometry, stage)
         if not self.cache_latents or stage != "fit":
             return
-        if not isinstance(self._datamodule, LidarDataModule):
+        if not isinstance(datamodule, LidarDataModule):
             raise ValueError(
                 "model.init_args.cache_latents needs a r3dpa.data.LidarDataModule, got "
-                f"{type(self._datamodule).__name__}; set it to false"
+                f"{type(datamodule).__name__}; set it to false"
             )
-        if self.augmentation is not None:
-            self.augmentation.check_latents(self.sit.input_size[1], self._datamodule.grid_size[1])
+        datamodule.augmentation.check_latents(self.sit.input_size[1], datamodule.grid_size[1])
 
     def on_fit_start(self) -> None:
         """Load the VAE, and encode the training scans that are not encoded yet.

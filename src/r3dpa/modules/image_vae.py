@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from r3dpa.data.image_datamodule import ImageBatch, ImageDataModule
 from r3dpa.losses import reconstruction_errors, reconstruction_loss
 from r3dpa.modules.settings import LossWeights, OptimizerConfig
-from r3dpa.modules.stage import Stage, check_trainer, networks_as_settings
+from r3dpa.modules.stage import Stage, networks_as_settings
 from r3dpa.nn import ImageVAE
 
 
@@ -65,7 +65,7 @@ class ImageVAETraining(ImageStage):
 
     def setup(self, stage: str) -> None:
         """Check trainer and data against the VAE."""
-        check_trainer(self.trainer)
+        self.check_trainer(self.trainer, fits=stage == "fit")
         size = self.images.image_size
         self.latent_shape = (self.vae.latent_channels, *self.vae.latent_size((size, size)))
 

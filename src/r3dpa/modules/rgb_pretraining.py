@@ -14,9 +14,10 @@ from r3dpa.data.images import ImageEntry
 from r3dpa.data.posterior_cache import cache_posteriors
 from r3dpa.data.store import CachedTensors
 from r3dpa.features import DINOv2
+from r3dpa.modules.checks import check_latents
 from r3dpa.modules.image_vae import ImageStage
 from r3dpa.modules.settings import LossWeights, OptimizerConfig, TimeSampling
-from r3dpa.modules.stage import check_latents, check_trainer, networks_as_settings
+from r3dpa.modules.stage import networks_as_settings
 from r3dpa.nn import EMA, ImageVAE, LatentNorm, Posterior, SiT
 
 
@@ -93,7 +94,7 @@ class RGBPretraining(ImageStage):
 
     def setup(self, stage: str) -> None:
         """Check trainer and data against the networks, and that a teacher has weights."""
-        check_trainer(self.trainer)
+        self.check_trainer(self.trainer, fits=stage == "fit")
         size = self.images.image_size
         check_latents(self.vae, self.sit, (size, size))
         if stage == "fit" and not all(network.trained for network in self._teacher):

@@ -110,17 +110,21 @@ class OptimizerConfig:
         values = asdict(self)
         return {name: values[name] for name in ("lr", "betas", "weight_decay", "eps")}
 
+    def check_last_step(self, max_steps: int) -> None:
+        """Refuse a rate that falls towards the last step where ``max_steps`` is not set."""
+        if max_steps < 1 and (self.decay_steps or self.cosine):
+            raise ValueError(
+                "optimizer.decay_steps and optimizer.cosine need the last step: set "
+                "--trainer.max_steps, or leave both out"
+            )
+
     def rate(self, step: int, max_steps: int) -> float:
         """Learning rate of the step after ``step`` optimiser steps, out of ``max_steps``.
 
         Raises:
             ValueError: If the rate falls, but ``max_steps`` is not set.
         """
-        if max_steps < 1 and (self.decay_steps or self.cosine):
-            raise ValueError(
-                "optimizer.decay_steps and optimizer.cosine need the last step: set "
-                "--trainer.max_steps, or leave both out"
-            )
+        self.check_last_step(max_steps)
         rising = (step + 1) / (self.warmup_steps + 1)
         falling = (max_steps - step) / self.decay_steps if self.decay_steps else 1.0
         if self.cosine:

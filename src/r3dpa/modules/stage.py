@@ -13,18 +13,19 @@ import lightning as L
 import torch
 from lightning.pytorch.callbacks import StochasticWeightAveraging
 from torch import Tensor, nn
-from torchmetrics import Metric
-from torchmetrics.utilities import dim_zero_cat
 
 from r3dpa import __version__, losses
+from r3dpa.checkpoints import Checkpoint
 from r3dpa.data.augmentation import Augmentation
 from r3dpa.flow.interpolant import LINEAR, Interpolant, sample_time
 from r3dpa.flow.noise import random_generator
 from r3dpa.geometry import ScanGeometry
 from r3dpa.io import source_commit
 from r3dpa.modules.alignment_release import ResidualAverages
+from r3dpa.modules.checks import check_planned_images, check_same_images, planned_geometry
+from r3dpa.modules.held_out import HeldOutMeans
 from r3dpa.modules.settings import LossWeights, OptimizerConfig, TimeSampling
-from r3dpa.nn import VAE, ImageVAE, VelocityNetwork
+from r3dpa.nn import VelocityNetwork
 
 _PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")
 
@@ -101,19 +102,46 @@ class Stage(L.LightningModule, ABC):
 
     # Data
 
+    def check_trainer(self, trainer: L.Trainer, *, fits: bool) -> None:
+        """Refuse settings of the trainer that this stage cannot run, or ``fits``, train with."""
+        check_trainer(trainer)
+        if fits:
+            self.optimizer_config.check_last_step(trainer.max_steps)
+
+    def check_before_data(
+        self, trainer: L.Trainer, datamodule: L.LightningDataModule, resumed: Checkpoint | None
+    ) -> None:
+        """Refuse what a fit cannot work with, as far as that shows before its data are prepared.
+
+        A fit checks all of it again, when scans may have been simulated for hours.
+
+        Args:
+            trainer: Trainer of the fit.
+            datamodule: Its data.
+            resumed: Checkpoint that it goes on from; None for a new run.
+        """
+        self.check_trainer(trainer, fits=True)
+        if resumed is None:
+            return
+        self._check_stage(resumed.stage)
+        planned = planned_geometry(datamodule)
+        if planned is not None and resumed.geometry is not None:
+            check_planned_images(planned, resumed.geometry, "the checkpoint")
+
     def attach_scans(self) -> tuple[Any, ScanGeometry]:
         """Data module and scan geometry, after a check of the trainer; keeps what files record.
 
         The data module may be any that gives :class:`r3dpa.data.LidarBatch` batches.
         """
-        check_trainer(self.trainer)
+        self.check_trainer(self.trainer, fits=self.trainer.state.fn == "fit")
         datamodule = getattr(self.trainer, "datamodule", None)
         geometry = getattr(datamodule, "geometry", None)
         if not isinstance(geometry, ScanGeometry):
             raise ValueError(
                 f"--data.class_path: {type(self).__name__} needs a data module that gives "
                 "r3dpa.data.LidarBatch batches and has a geometry (r3dpa.geometry.ScanGeometry), "
-                f"such as r3dpa.data.LidarDataModule, got {type(datamodule).__name__}"
+                f"such as r3dpa.data.LidarDataModule, got {type(datamodule).__name__}; in Python, "
+                "give trainer.fit a datamodule"
             )
         self.geometry = geometry
         self.augmentation = getattr(datamodule, "augmentation", None)
@@ -359,11 +387,7 @@ class Stage(L.LightningModule, ABC):
         """
         self.loaded_step = checkpoint.get("global_step", 0)
         facts = checkpoint.get("r3dpa", {})
-        if facts.get("stage") != self.stage:
-            raise ValueError(
-                f"the checkpoint is of stage {facts.get('stage')!r}, this is {self.stage!r}; to "
-                "start a stage from another one, give --model.init_args.init_from, not --ckpt_path"
-            )
+        self._check_stage(facts.get("stage"))
         self.residuals = ResidualAverages(**checkpoint.get("alignment_residuals", {}))
         for state in checkpoint.get("optimizer_states", []):
             for group in state["param_groups"]:
@@ -371,49 +395,19 @@ class Stage(L.LightningModule, ABC):
         if "geometry" in facts:
             self._check_geometry(ScanGeometry.from_dict(facts["geometry"]), "the checkpoint")
 
+    def _check_stage(self, stage: str | None) -> None:
+        """Refuse to go on from the checkpoint of another stage."""
+        if stage != self.stage:
+            raise ValueError(
+                f"the checkpoint is of stage {stage!r}, this is {self.stage!r}; to start a stage "
+                "from another one, give --model.init_args.init_from, not --ckpt_path"
+            )
+
     def _check_geometry(self, recorded: ScanGeometry, source: str) -> None:
         """Refuse weights that were trained on other range images than this run's."""
         if self.geometry is None:
             self.geometry = recorded
-        for name in ("projection", "codec"):
-            theirs, ours = getattr(recorded, name), getattr(self.geometry, name)
-            if theirs != ours:
-                raise ValueError(
-                    f"{source} was trained on other range images: {name} {theirs} there, {ours} "
-                    "here. Set sensor, projection and codec of the data module as in the "
-                    "checkpoint"
-                )
-
-
-class HeldOutMeans(Metric):
-    """Means over held-out samples, each counted once, whatever the batches and processes.
-
-    Loaders of several processes repeat samples to give all of them the same number of batches.
-    """
-
-    full_state_update = False
-    index: list[Tensor]
-    values: list[Tensor]
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.names: tuple[str, ...] = ()
-        self.add_state("index", [], dist_reduce_fx="cat")
-        self.add_state("values", [], dist_reduce_fx="cat")
-
-    def update(self, index: Tensor, **sums: Tensor | tuple[Tensor, Tensor]) -> None:
-        """Add samples by their index ``(B,)``: a value ``(B,)`` each, or its sum and weight."""
-        pairs = [s if isinstance(s, tuple) else (s, torch.ones_like(s)) for s in sums.values()]
-        self.names = tuple(sums)
-        self.index.append(index)
-        self.values.append(torch.stack([torch.stack(pair, dim=1).float() for pair in pairs], dim=1))
-
-    def compute(self) -> dict[str, float]:
-        """Means by name; 0 where all weights are 0."""
-        index, order = dim_zero_cat(self.index).cpu().sort(stable=True)
-        once = order[index.diff(prepend=index[:1] - 1) != 0]
-        total, weight = dim_zero_cat(self.values).cpu()[once].double().sum(dim=0).unbind(dim=1)
-        return dict(zip(self.names, (total / weight.clamp(min=1)).tolist(), strict=True))
+        check_same_images(self.geometry, recorded, source)
 
 
 @contextmanager
@@ -479,21 +473,4 @@ def check_trainer(trainer: L.Trainer) -> None:
         raise ValueError(
             "StochasticWeightAveraging is not supported: leave the callback out; stages that train "
             "a SiT keep an average of their own, see --model.init_args.ema_decay"
-        )
-
-
-def check_latents(vae: VAE | ImageVAE, sit: VelocityNetwork, image_size: tuple[int, int]) -> None:
-    """Refuse a velocity network of other latents than the images have."""
-    if sit.in_channels != vae.latent_channels:
-        raise ValueError(
-            f"the {type(sit).__name__} has in_channels {sit.in_channels}, but the VAE has "
-            f"{vae.latent_channels} latent channels; set "
-            "--model.init_args.sit.init_args.in_channels to the latter"
-        )
-    latent_size = vae.latent_size(image_size)
-    if latent_size != tuple(sit.input_size):
-        raise ValueError(
-            f"images of {image_size} pixels give {latent_size} latents, but the "
-            f"{type(sit).__name__} has input_size {tuple(sit.input_size)}; set "
-            "--model.init_args.sit.init_args.input_size to the former"
         )
