@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from whole_checkpoint import EXACT, SIT_ARGS, randomised
+from whole_checkpoint import EXACT, GEOMETRY, SIT_ARGS, randomised
 
 from r3dpa.checkpoints import (
     Checkpoint,
@@ -103,6 +103,16 @@ class TestTransfer:
         before = copy.deepcopy(sit.state_dict())
         with pytest.raises(ValueError, match=message):
             transfer_rgb(self.source(**changes), sit, LatentNorm(4), keep_projector=True)
+        torch.testing.assert_close(sit.state_dict(), before, **EXACT)
+
+    def test_weights_of_range_images_are_none_of_rgb(self):
+        source = replace(self.source(), stage="joint", geometry=GEOMETRY.to_dict())
+        sit = randomised(SiT(**SIT_ARGS))
+        before = copy.deepcopy(sit.state_dict())
+        with pytest.raises(
+            ValueError, match=r"rgb\.pt is of stage joint .* range images: .*init_f"
+        ):
+            transfer_rgb(source, sit, LatentNorm(4), keep_projector=True)
         torch.testing.assert_close(sit.state_dict(), before, **EXACT)
 
     def test_only_a_sit_has_rgb_weights(self):

@@ -49,9 +49,15 @@ def transfer_rgb(
     it has as many tokens.
 
     Raises:
-        ValueError: If the checkpoint holds no SiT, or anything beside those groups does not fit;
-            nothing is changed then.
+        ValueError: If the checkpoint was trained on scans or holds no SiT, or anything beside those
+            groups does not fit; nothing is changed then.
     """
+    if checkpoint.geometry is not None:
+        raise ValueError(
+            f"{checkpoint.path} is of stage {checkpoint.stage} and was trained on range images: "
+            "rgb_weights takes a checkpoint of stage rgb_pretraining, or an official one; give "
+            "a checkpoint of a stage before as --model.init_args.init_from"
+        )
     rgb, statistics = checkpoint.network("sit"), checkpoint.network("latent_norm")
     if not issubclass(rgb.kind, SiT):
         raise ValueError(
