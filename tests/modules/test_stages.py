@@ -138,6 +138,8 @@ def test_a_checkpoint_is_evaluated(command, smoke_args, vae_checkpoint, tmp_path
     assert len(pictures) == (command != "predict")
     written = list((tmp_path / "reconstructions").rglob("*.bin"))
     assert len(written) == (12 if command == "predict" else 0)
+    named = f"reconstructions: {tmp_path / 'reconstructions'}" in caplog.text
+    assert named == (command == "predict")
     assert not (tmp_path / "config.yaml").exists()  # that of the training would be replaced
     assert all(len(read_scan(path)) > 0 for path in written)
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, cast
 import lightning as L
 import torch
 from lightning.pytorch.loggers import WandbLogger
-from lightning.pytorch.utilities import rank_zero_warn
+from lightning.pytorch.utilities import rank_zero_info, rank_zero_warn
 from matplotlib.figure import Figure
 from torch import Tensor
 
@@ -36,10 +36,18 @@ class ReconstructionWriter(L.Callback):
         dataloader_idx: int = 0,
     ) -> None:
         """Write the points of each reconstructed range image, intensity 0."""
-        folder = Path(trainer.default_root_dir) / "reconstructions"
+        folder = _reconstructions(trainer)
         for name, range_m in zip(batch["name"], outputs.float().cpu(), strict=True):
             points = points_of(range_m, pl_module.scan_geometry.projection)
             write_bin(folder / f"{name}.bin", points)
+
+    def on_predict_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Name the folder."""
+        rank_zero_info(f"reconstructions: {_reconstructions(trainer)}")
+
+
+def _reconstructions(trainer: L.Trainer) -> Path:
+    return Path(trainer.default_root_dir) / "reconstructions"
 
 
 class PictureLogger(L.Callback):
