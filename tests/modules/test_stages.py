@@ -158,6 +158,13 @@ def test_a_second_fit_does_not_mix_with_the_first(joint_run, smoke_args):
     assert (joint_run / "checkpoints" / "last.ckpt").read_bytes() == before
 
 
+def test_the_first_run_of_a_resumable_command_says_that_it_starts(smoke_args, tmp_path, caplog):
+    more = [*QUICK, "--ckpt_path=last", "--model.init_args.sit.init_args.in_channels=8"]
+    with caplog.at_level("INFO"), pytest.raises(ValueError, match="in_channels"):
+        main(smoke_args("joint", tmp_path, *more))
+    assert f"no checkpoint in {tmp_path}: training starts at step 0" in caplog.text
+
+
 def test_a_refused_resume_keeps_the_configuration_of_the_run(joint_run, smoke_args, tmp_path):
     """Weights of another width are refused only where Lightning loads them."""
     shutil.copytree(joint_run, tmp_path / "run")

@@ -239,6 +239,8 @@ class StageCLI(LightningCLI):
         config = self.config[self.config.subcommand]
         if config.get("ckpt_path") == "last":
             config.ckpt_path = _newest(Path(config.run_dir))
+            if config.ckpt_path is None and self._command == "fit":
+                rank_zero_info(f"no checkpoint in {config.run_dir}: training starts at step 0")
         if config.get("ckpt_path"):
             self._resumed = replace(read_checkpoint(config.ckpt_path), networks={})
             if Path(config.ckpt_path).suffix != ".ckpt":  # released or exported
