@@ -6,7 +6,7 @@ import pytest
 import torch
 import yaml
 
-from r3dpa.checkpoints import read_checkpoint
+from r3dpa.checkpoints import networks, read_checkpoint
 from r3dpa.cli import main
 
 
@@ -107,6 +107,43 @@ class TestCheckpoints:
         with pytest.raises(ValueError, match=r"a\.ckpt: vae: class 'hostile.Model' is not allowed"):
             read_checkpoint(path)
         assert "hostile" not in sys.modules
+
+    def test_a_network_of_a_user_needs_the_command_line(self, tmp_path, monkeypatch):
+        """Nothing in the file allows it; the package stays allowed until the process ends."""
+        package = "networks_of_a_user"
+        text = "from torch import nn\nclass Own(nn.Linear): ..."
+        (tmp_path / f"{package}.py").write_text(text)
+        monkeypatch.syspath_prepend(str(tmp_path))
+        monkeypatch.setattr(networks, "_further_packages", [])
+        path = tmp_path / "own.ckpt"
+        init_args = {"in_features": 1, "out_features": 1, "bias": False}
+        config = {"class_path": f"{package}.Own", "init_args": init_args}
+        content = {
+            "pytorch-lightning_version": "2.6.6",
+            "state_dict": {"vae.weight": torch.zeros(1, 1)},
+            "hyper_parameters": {"vae": config, "allow_import": [package]},
+            "allow_import": [package],
+        }
+        torch.save(content, path)
+        words = ["convert", str(path), str(tmp_path / "own.safetensors")]
+        with pytest.raises(ValueError, match=r"Own' is not allowed: .* --allow_import PACKAGE"):
+            main(words)
+        assert package not in sys.modules
+        main([*words, "--allow_import", package])
+        assert type(read_checkpoint(words[2]).network("vae").build()).__name__ == "Own"
+
+    @pytest.mark.parametrize(
+        ("class_path", "message"),
+        [
+            ("absent_package.Own", r"cannot be imported \(No module .*: install its package, or"),
+            ("r3dpa.nn.Absent", "does not exist"),
+            ("absent_package_2.Own", "is not allowed"),  # whose name only starts alike
+        ],
+    )
+    def test_a_class_that_cannot_be_imported(self, class_path, message, tmp_path, monkeypatch):
+        monkeypatch.setattr(networks, "_further_packages", ["absent_package"])
+        with pytest.raises(ValueError, match=message):
+            read_checkpoint(self.lightning(tmp_path / "a.ckpt", class_path))
 
     @pytest.mark.parametrize("init_args", [{"channels": "many"}, ["no", "mapping"]])
     def test_arguments_that_no_network_takes(self, init_args, tmp_path):

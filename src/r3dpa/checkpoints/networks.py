@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import reprlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -29,7 +29,8 @@ FACTS = (
     "commit",
 )
 
-_ALLOWED_PACKAGES = ("r3dpa.nn.", "r3dpa.features.", "r3dpa.baselines.")
+_OWN_PACKAGES = ("r3dpa.nn", "r3dpa.features", "r3dpa.baselines")
+_further_packages: list[str] = []
 _NUM_LISTED = 10
 _LARGEST_SIDE = 2048  # of images, which no weights may have
 #: Averaged copy of a network, which it may start from.
@@ -45,6 +46,24 @@ _SHAPELESS_ARGS = {
     "norm_groups": "num_groups",
     "stem": "stem",
 }
+
+
+def allow_networks_of(packages: Iterable[str]) -> None:
+    """Let checkpoints name networks of these packages too, until the process ends.
+
+    Reading such a checkpoint imports the package. Only who started the process may allow it, as by
+    ``--allow_import``, and nothing that a file says.
+
+    Args:
+        packages: Import paths of packages, modules or classes.
+    """
+    _further_packages.extend(packages)
+
+
+def _is_allowed(import_path: str) -> bool:
+    """Whether a checkpoint may name what has this import path."""
+    allowed = (*_OWN_PACKAGES, *_further_packages)
+    return any(f"{import_path}.".startswith(f"{package}.") for package in allowed)
 
 
 def path_of(kind: type) -> str:
@@ -73,7 +92,7 @@ def _numbers(value: Any) -> Iterator[int]:
 
 @dataclass(frozen=True)
 class NetworkState:
-    """One network as data: class of this package, plain constructor arguments, weights."""
+    """One network as data: class of an allowed package, plain constructor arguments, weights."""
 
     class_path: str
     init_args: Mapping[str, Any]
@@ -101,21 +120,28 @@ class NetworkState:
         """The class.
 
         Raises:
-            ValueError: If it is no network of this package.
+            ValueError: If it is no network of this package or an allowed one, or cannot be
+                imported.
         """
         module_path, _, name = self.class_path.rpartition(".")
-        if f"{module_path}.".startswith(_ALLOWED_PACKAGES):
+        if _is_allowed(self.class_path):
             try:
                 kind = getattr(importlib.import_module(module_path), name)
-            except (ImportError, AttributeError) as error:
+            except ImportError as error:
+                raise ValueError(
+                    f"class {self.class_path!r} cannot be imported ({error}): install its package, "
+                    "or name the folder of the package in PYTHONPATH"
+                ) from None
+            except AttributeError as error:
                 raise ValueError(f"class {self.class_path!r} does not exist ({error})") from None
             is_network = isinstance(kind, type) and issubclass(kind, nn.Module)
-            if is_network and kind.__module__.startswith(_ALLOWED_PACKAGES):
+            if is_network and _is_allowed(path_of(kind)):
                 return kind
         raise ValueError(
             f"class {self.class_path!r} is not allowed: a checkpoint may only name networks "
-            "defined in r3dpa.nn, r3dpa.features or r3dpa.baselines. Edit the class_path if the "
-            "class was moved; otherwise do not trust the file"
+            "defined in r3dpa.nn, r3dpa.features or r3dpa.baselines, and in a package of yours "
+            "after --allow_import PACKAGE. Edit the class_path if the class was moved; otherwise "
+            "do not trust the file"
         )
 
     @property

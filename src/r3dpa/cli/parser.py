@@ -189,14 +189,20 @@ def _item_types(kind: Any) -> set[Any]:
 
 
 def allow_imports(words: Sequence[str]) -> list[str]:
-    """Let configurations name the packages after ``--allow_import``; return the other words.
+    """Let files name classes of the packages after ``--allow_import``; return the other words.
 
-    These are words of the command line alone: no configuration can allow itself anything.
+    Files are configurations and checkpoints. These are words of the command line alone: no file can
+    allow itself anything.
     """
     parser = argparse.ArgumentParser(prog="r3dpa", add_help=False, allow_abbrev=False)
     parser.add_argument("--allow_import", action="append", default=[], metavar="PACKAGE")
     given, others = parser.parse_known_args(list(words))
     set_parsing_settings(import_path_allowlist=given.allow_import)
+    if given.allow_import:
+        # Imported here: torch takes seconds, and most commands allow nothing.
+        from r3dpa.checkpoints.networks import allow_networks_of
+
+        allow_networks_of(given.allow_import)
     return others
 
 
