@@ -54,7 +54,8 @@ def test_the_losses_of_the_step_come_back(stage, tmp_path):
     then, now = (line for line in text.splitlines() if line.startswith("losses "))
     assert then.endswith("loss inf")
     assert now.endswith(f"loss {total:.3g}")
-    assert text.endswith("layers whose output is not finite: 0, from finite inputs: none")
+    assert "layers whose output is not finite: 0, from finite inputs: none" in text
+    assert "\nthese weights give finite values for this batch" in text
 
 
 def test_a_broken_input_is_told_from_a_broken_layer(tmp_path):
@@ -71,6 +72,13 @@ def test_the_layer_at_fault_is_named(file, tmp_path):
     text = replay(file, save(module, tmp_path / "broken.safetensors"))
     assert "sit.blocks.1.mlp.fc1.bias: 1 of" in text
     assert text.endswith("from finite inputs: sit.blocks.1.mlp.fc1")
+
+
+def test_a_folder_is_answered_with_its_files(file, tmp_path):
+    with pytest.raises(ValueError, match=rf"is a folder; give one of its files: {file.name}$"):
+        replay(file.parent, tmp_path / "before.safetensors")
+    with pytest.raises(ValueError, match="is a folder; it holds no saved batch"):
+        replay(tmp_path, tmp_path / "before.safetensors")
 
 
 def test_networks_of_another_size_are_refused(file, tmp_path):

@@ -111,6 +111,14 @@ class TestTheReport:
         assert module.guard.skipped == 4
         assert len(list((tmp_path / "bad_batches").iterdir())) == 2
 
+    def test_the_error_of_a_stopped_run_is_a_command_for_its_newest_batch(self, tmp_path):
+        module = guarded("joint", range(4))
+        with pytest.raises(RuntimeError, match="4 steps in a row") as caught:
+            train(module, NamedData(4), StepGuard(max_skipped_steps=4), default_root_dir=tmp_path)
+        newest = tmp_path / "bad_batches" / "step_0000002_batch_0000002_rank_0.pt"
+        assert newest.is_file()
+        assert f"Run `r3dpa replay {newest} CKPT`" in str(caught.value)
+
     def test_a_full_disk_does_not_end_the_training(self, tmp_path, monkeypatch):
         def full(*_):
             raise OSError(28, "No space left on device")

@@ -44,12 +44,21 @@ def save_bad_batch(
     return path
 
 
+def list_bad_batches(folder: Path) -> list[Path]:
+    """Files of :func:`save_bad_batch` in a folder, the newest last."""
+    return sorted(folder.glob("step_*.pt"), key=lambda path: (path.stat().st_mtime_ns, path))
+
+
 def read_bad_batch(path: Path) -> dict[str, Any]:
     """Read a file of :func:`save_bad_batch`.
 
     Raises:
-        ValueError: If the file is damaged; the error names it.
+        ValueError: If it is a folder, or the file is damaged; the error names it.
     """
+    if path.is_dir():
+        names = ", ".join(file.name for file in list_bad_batches(path))
+        what = f"give one of its files: {names}" if names else "it holds no saved batch"
+        raise ValueError(f"{path} is a folder; {what}")
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
         return content | {"draws": PathDraws(**content["draws"])}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import lightning as L
@@ -11,7 +12,7 @@ from jsonargparse.typing import NonNegativeInt, PositiveInt
 from lightning.pytorch.utilities import rank_zero_warn
 from torch import Tensor
 
-from r3dpa.callbacks.bad_batches import format_values, report_bad_batches
+from r3dpa.callbacks.bad_batches import format_values, list_bad_batches, report_bad_batches
 from r3dpa.modules.stage import gradient_norms
 
 
@@ -85,9 +86,9 @@ class StepGuard(L.Callback):
         if self.in_a_row >= self.max_skipped_steps:
             raise RuntimeError(
                 f"{self.in_a_row} steps in a row had a non-finite loss or gradient, the last at "
-                f"step {trainer.global_step} (gradient norms: {values}). Run `r3dpa replay` on "
-                f"{trainer.default_root_dir}/bad_batches; if the samples are sound, lower the "
-                "learning rate, or leave fp16 for bf16 or fp32"
+                f"step {trainer.global_step} (gradient norms: {values}). "
+                f"{_replay_advice(trainer)}If the samples are sound, lower the learning rate, or "
+                "leave fp16 for bf16 or fp32"
             )
 
     def _find_faults(self, norms: Tensor) -> list[int]:
@@ -114,3 +115,15 @@ class StepGuard(L.Callback):
     def load_state_dict(self, state_dict: dict[str, int]) -> None:
         """Restore both counters."""
         self.skipped, self.in_a_row = state_dict["skipped"], state_dict["in_a_row"]
+
+
+def _replay_advice(trainer: L.Trainer) -> str:
+    """Sentence with the command that repeats the newest saved step; empty where none was saved."""
+    run_dir = Path(trainer.default_root_dir)
+    saved = list_bad_batches(run_dir / "bad_batches")
+    if not saved:
+        return ""
+    return (
+        f"Run `r3dpa replay {saved[-1]} CKPT` with the last checkpoint before it in "
+        f"{run_dir / 'checkpoints'} as CKPT. "
+    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -89,7 +90,7 @@ def replay(file: Path, ckpt: Path, device: str = "cpu") -> str:
     The losses are computed in float32, with the draws and loss weights of the step.
 
     Args:
-        file: Batch of ``<run_dir>/bad_batches``.
+        file: One of the files in ``<run_dir>/bad_batches``.
         ckpt: Weights, ideally of the last step before it.
         device: ``cpu``, ``cuda`` or ``cuda:1``.
     """
@@ -131,4 +132,9 @@ def replay(file: Path, ckpt: Path, device: str = "cpu") -> str:
     lines.append(f"losses now:  {format_values(losses)}")
     causes = ", ".join(name for name, inputs_finite in broken.items() if inputs_finite) or "none"
     lines.append(f"layers whose output is not finite: {len(broken)}, from finite inputs: {causes}")
+    if not broken and all(map(math.isfinite, losses.values())):
+        lines.append(
+            "these weights give finite values for this batch in float32: look at later weights, at "
+            "the gradients, or at the precision of the step"
+        )
     return "\n".join(lines)
