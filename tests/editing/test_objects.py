@@ -197,7 +197,7 @@ def test_the_draw_most_like_the_object_comes_first():
 
 
 def test_points_outside_of_the_box_make_no_object():
-    """The first draw is most like the feature, but in front of the box, but for a pixel the third."""
+    """The first draw is most like the feature, but in front of the box; so is most of the third."""
     projection = SphericalProjection(LidarSensor(beams=4, columns=8))
     mask = torch.zeros(4, 8, dtype=torch.bool)
     mask[2:, 4:6] = True

@@ -233,17 +233,25 @@ class FewStep(FlowMatching):
             reached = average_velocity_steps(sit.average_velocity, draws.noise, average_times(num))
             errors[f"endpoint_{num}"] = losses.flow_matching_loss(reached, end)
         if self.thin_decoder is not None:
-            geometry, image = self.scan_geometry, self.thin_decoder.decode(latents)
-            full, thin = (
-                geometry.codec.ranges_of(i, geometry.projection.sensor)
-                for i in (reconstruction, image)
-            )
-            both, either = (full > 0) & (thin > 0), (full > 0) | (thin > 0)
-            count = both.flatten(1).sum(dim=1)
-            error = torch.where(both, (full - thin).abs(), 0.0).flatten(1).sum(dim=1)
-            errors["thin_range_error_m"] = error, count
-            errors["thin_return_iou"] = count, either.flatten(1).sum(dim=1)
+            errors |= self._thin_decoder_errors(reconstruction, self.thin_decoder.decode(latents))
         return errors
+
+    def _thin_decoder_errors(
+        self, reconstruction: Tensor, image: Tensor
+    ) -> dict[str, Tensor | tuple[Tensor, Tensor]]:
+        """Ranges and returns of the thin decoder beside the VAE's, as sums and counts ``(B,)``."""
+        geometry = self.scan_geometry
+        full, thin = (
+            geometry.codec.ranges_of(each, geometry.projection.sensor)
+            for each in (reconstruction, image)
+        )
+        both, either = (full > 0) & (thin > 0), (full > 0) | (thin > 0)
+        num_both = both.flatten(1).sum(dim=1)
+        error_m = torch.where(both, (full - thin).abs(), 0.0).flatten(1).sum(dim=1)
+        return {
+            "thin_range_error_m": (error_m, num_both),
+            "thin_return_iou": (num_both, either.flatten(1).sum(dim=1)),
+        }
 
     def _decoder_losses(self, latents: Tensor) -> dict[str, Tensor]:
         """Losses of the thin decoder on a quarter of the global batch, perhaps none of it here."""
