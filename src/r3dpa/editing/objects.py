@@ -13,7 +13,6 @@ from typing import Any, Self
 
 import torch
 import torch.nn.functional as F
-from einops import repeat
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
@@ -23,6 +22,7 @@ from r3dpa.data.feature_grids import Extractor, grid_of_points
 from r3dpa.data.labels import CLASS_NAMES, read_labels
 from r3dpa.data.scans import Scan
 from r3dpa.editing.editor import EditResult
+from r3dpa.editing.regions import token_mask
 from r3dpa.geometry import (
     LidarSensor,
     Pixels,
@@ -241,11 +241,11 @@ def most_like_first(
 ) -> EditResult:
     """Order the draws of an inpainted part by their likeness to an object, the greatest first.
 
-    Likeness is the mean over the part's pixels of the cosine between the feature of the object and
-    the feature of the pixel's cell, which the feature source takes from the points of the draw. A
-    pixel without a return counts as 0, and where the object has a box, one with a point in front of
-    it or behind it does too. The ``cosine`` of the edits cannot replace it: it is of features that
-    the network predicts, which guidance may raise without making an object.
+    Likeness is the mean cosine between the feature of the object and the features of the part's
+    cells, which the feature source takes from the points of the draw. Where the object has a box,
+    points in front of it and behind it do not count, and a cell without others has a cosine of 0.
+    The ``cosine`` of the edits cannot replace it: it is of features that the network predicts,
+    which guidance may raise without making an object.
 
     Args:
         edits: Draws of :meth:`SceneEditor.inpaint`.
@@ -260,21 +260,15 @@ def most_like_first(
         The edits in that order, with their ``draws`` and ``likeness``, and ``points_inside`` if
         there is a box.
     """
-    projection, cell = edits.projection, edits.projection.sensor.cell_size(grid_size)
-    means, counts = [], []
+    tokens, projection = token_mask(pixel_mask, grid_size), edits.projection
+    cosines, counts = [], []
     for scene in edits:
         points = points_at_pixels(Pixels(scene.range_m, scene.intensity), projection)
-        counted = scene.range_m > 0
-        if inside is not None:
-            counted[counted.clone()] = inside(points[:, :3])
-        counted &= pixel_mask
-        of_points = counted[scene.range_m > 0]
-        cells = grid_of_points(extractor, points, projection, grid_size, of_points)
-        cosine = F.cosine_similarity(cells, feature, dim=1).reshape(grid_size)
-        of_pixels = repeat(cosine, "h w -> (h rows) (w columns)", rows=cell[0], columns=cell[1])
-        means.append(torch.where(counted, of_pixels, 0.0)[pixel_mask].mean())
-        counts.append(int(counted.sum()))
-    likeness = torch.stack(means)
+        counted = None if inside is None else inside(points[:, :3])
+        cells = grid_of_points(extractor, points, projection, grid_size, counted)[tokens]
+        cosines.append(F.cosine_similarity(cells, feature, dim=1).mean())
+        counts.append(len(points) if counted is None else int(counted.sum()))
+    likeness = torch.stack(cosines)
     measured = replace(
         edits,
         draws=torch.arange(len(edits)),
