@@ -197,21 +197,22 @@ def test_the_draw_most_like_the_object_comes_first():
 
 
 def test_points_outside_of_the_box_make_no_object():
-    """The first draw is most like the feature, but in front of the box."""
+    """The first draw is most like the feature, but in front of the box; so is most of the third."""
     projection = SphericalProjection(LidarSensor(beams=4, columns=8))
     mask = torch.zeros(4, 8, dtype=torch.bool)
     mask[2:, 4:6] = True
-    range_m = torch.full((2, 4, 8), 30.0)
-    range_m[0, mask], range_m[1, mask] = 10.0, 15.0
-    edits = EditResult(range_m, torch.arange(2.0), 2, projection)
+    range_m = torch.full((3, 4, 8), 30.0)
+    range_m[0, mask], range_m[1, mask], range_m[2, mask] = 10.0, 15.0, 10.0
+    range_m[2, 2, 4] = 15.0
+    edits = EditResult(range_m, torch.arange(3.0), 2, projection)
     arguments = edits, mask, torch.tensor([1.0, 1.0]), Distances(), (2, 4)
-    assert most_like_first(*arguments).draws.tolist() == [0, 1]
+    assert most_like_first(*arguments).draws.tolist() == [0, 2, 1]
     assert most_like_first(*arguments).points_inside is None
     box = {"inside": lambda points: (points.norm(dim=1) > 12) & (points.norm(dim=1) < 20)}
     ordered = most_like_first(*arguments, **box)
-    assert ordered.draws.tolist() == [1, 0]
-    assert ordered.points_inside.tolist() == [4, 0]
-    assert ordered.likeness[1] == 0
+    assert ordered.draws.tolist() == [1, 0, 2]
+    assert ordered.points_inside.tolist() == [4, 0, 1]
+    assert ordered.likeness.argmax() == 1
 
 
 def test_library_comes_back_from_its_file(tmp_path, library):

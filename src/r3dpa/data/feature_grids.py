@@ -278,19 +278,10 @@ def pooled_grids(
 
 
 def grid_of_points(
-    extractor: Extractor,
-    points: Tensor,
-    projection: Projection,
-    grid_size: tuple[int, int],
-    counted: Tensor | None = None,
+    extractor: Extractor, points: Tensor, projection: Projection, grid_size: tuple[int, int]
 ) -> Tensor:
-    """Feature grid ``(N, D)`` float32 on the CPU of points ``(P, 4)`` that are no file.
-
-    Of all points, those that are ``counted`` ``(P,)`` are averaged; default: all.
-    """
+    """Feature grid ``(N, D)`` float32 on the CPU of points ``(P, 4)`` that are no file."""
     values = extractor.point_features([extractor.prepare(points)])[0]
-    if counted is not None:
-        points, values = points[counted], values[counted.to(values.device)]
     return _pooled(extractor, points, values, projection, grid_size)
 
 
