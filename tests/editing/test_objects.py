@@ -196,7 +196,7 @@ def test_the_draw_most_like_the_object_comes_first():
     assert ordered.likeness[3] == 0
 
 
-def test_points_outside_of_the_box_make_no_object():
+def test_draws_that_miss_the_box_come_last():
     """The first draw is most like the feature, but in front of the box; so is most of the third."""
     projection = SphericalProjection(LidarSensor(beams=4, columns=8))
     mask = torch.zeros(4, 8, dtype=torch.bool)

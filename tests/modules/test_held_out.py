@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import socket
 from types import SimpleNamespace
@@ -56,6 +57,14 @@ def test_the_error_in_metres_is_the_mean_over_pixels(batch_size, tmp_path):
         error_m = (codec.to_range(module.reconstruct(image)) - codec.to_range(image)).abs()
     assert mask.sum() == 139
     assert logged["val/range_error_m"] == pytest.approx(error_m[mask].mean().item(), rel=1e-5)
+
+
+def test_a_pixel_at_infinity_does_not_count(tmp_path):
+    """Decoders say anything where there is no return, and 2 to its power may overflow."""
+    module, data = stage_module("vae_alignment"), HeldOut(4)
+    mask = data.whole["valid_mask"]
+    module.vae.image_of = lambda prediction: torch.where(mask, 0.0, torch.inf)
+    assert math.isfinite(validated(module, data, tmp_path)["val/range_error_m"])
 
 
 def test_the_average_is_evaluated_where_there_is_one(tmp_path):

@@ -49,19 +49,19 @@ def check(folder: Path, *, columns: tuple[str, ...] = ()) -> None:
     if not kitti and not is_layout:
         with suppress(ScanError):  # which check_scans says
             others = find_files(folder)[1]
-    errors: dict[Path, ScanError] = {}
+    num_bad = 0
     for file in others or evenly(kitti, 4):
         try:
             cloud = read_cloud(file, columns)
             cloud.check_metres()
             lines.append(describe_scan(cloud))
-        except ScanError as error:
-            errors[file.resolve()] = error
+        except ScanError as error:  # of a .bin file, which check_scans names
+            num_bad += 1
             lines += [f"bad: {error}"] if others else []
     if others:
-        text, usable = f"{folder.absolute()}: {verdict(len(others), len(errors))}", not errors
+        text, usable = f"{folder.absolute()}: {verdict(len(others), num_bad)}", not num_bad
     else:
-        text, usable = check_scans(folder, errors)
+        text, usable = check_scans(folder)
     is_plain = not is_layout and bool(others or kitti)
     if is_plain and (line := skipped_files(files_below(folder), others or kitti)):
         lines.append(line)

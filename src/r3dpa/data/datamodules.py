@@ -237,8 +237,7 @@ class LidarDataModule(LoaderModule):
         predicting = self.trainer is not None and self.trainer.predicting
         if predicting or self.features_dir is None or self.extractor is None:
             return
-        train, val = self.limited_split()
-        projection = self._fitted_projection()
+        train, val, projection = self._scans_and_projection()
         extractor = cast(Extractor, self.extractor.eval())
         num_made = write_feature_grids(
             train + val,
@@ -255,8 +254,7 @@ class LidarDataModule(LoaderModule):
 
         Before training, the share of the points that the images hold is printed.
         """
-        train, val = self.limited_split()
-        self.projection = self._fitted_projection()
+        train, val, self.projection = self._scans_and_projection()
         scans, grids = sorted({*train, *val}), None  # a scan may be repeated in training
         if stage == "fit" and scans and not self.makes_scans:
             # Held-out scans are none of further_scans.
@@ -311,7 +309,7 @@ class LidarDataModule(LoaderModule):
         return self.loader(self.all_set, train=False)
 
     @property
-    def _known_projection(self) -> Projection:
+    def known_projection(self) -> Projection:
         """Projection of the sensor, unless scans are needed for it."""
         if self.projection_kind == "beams" and self.beams is not None:
             return self.beams
@@ -327,14 +325,15 @@ class LidarDataModule(LoaderModule):
             return Path(cast(str, self.scans)) / "feature_grids" / name
         return default_features_dir(self.scans, name)
 
-    def _fitted_projection(self) -> Projection:
-        """Projection of the images; rings are fitted to the first training scans."""
-        if self.projection_kind != "rings":
-            return self._known_projection
+    def _scans_and_projection(self) -> tuple[list[Scan], list[Scan], Projection]:
+        """:meth:`limited_split`, and the projection; rings are fitted to the first scans of all."""
         train, val = self.split()
-        first = (train or val)[:_SCANS_TO_FIT]
-        points = (torch.from_numpy(scan.read(self.sensor)[:, :3]) for scan in first)
-        return RingProjection.fit(points, self.sensor)
+        projection = self.known_projection
+        if self.projection_kind == "rings":
+            first = (train or val)[:_SCANS_TO_FIT]
+            points = (torch.from_numpy(scan.read(self.sensor)[:, :3]) for scan in first)
+            projection = RingProjection.fit(points, self.sensor)
+        return evenly(train, self.limit), evenly(val, self.limit), projection
 
 
 class KITTI360DataModule(LidarDataModule):

@@ -124,7 +124,7 @@ class SimulatedImageDataModule(SimulatedDataModule):
         """Simulate what is missing, and make its feature grids."""
         train, val = self.limited_split()
         images: list[Any] = sorted(train + val)
-        projection = self._known_projection
+        projection = self.known_projection
         grids = None
         if self.features_dir is not None and self.extractor is not None:
             extractor = cast(Extractor, self.extractor.eval())
@@ -145,11 +145,11 @@ class SimulatedImageDataModule(SimulatedDataModule):
         """Cached images of all scans."""
         train, val = self.limited_split()
         images: list[Any] = sorted(train + val)
-        return CachedPixels(CachedTensors(self._store, images), self._known_projection)
+        return CachedPixels(CachedTensors(self._store, images), self.known_projection)
 
     def points(self, scan: Any) -> Tensor:
         """Points ``(P, 3)`` at the centres of the pixels."""
-        return points_of(self.images.read(scan).range_m, self._known_projection)
+        return points_of(self.images.read(scan).range_m, self.known_projection)
 
     @property
     def image_bytes(self) -> int:
@@ -169,7 +169,7 @@ class SimulatedImageDataModule(SimulatedDataModule):
             "sensor": self.simulation_sensor,
             "effects": self.effects,
             "weather": None if self.weather is None else asdict(self.weather),
-            "projection": projection_to_dict(self._known_projection),
+            "projection": projection_to_dict(self.known_projection),
         }
         shape = (self.sensor.beams, self.sensor.columns)
         if not self.has_values:
@@ -215,7 +215,7 @@ class SimulatedImageDataModule(SimulatedDataModule):
             return
         rank_zero_info(f"making {len(missing)} feature grids in {grids.folder}")
         extractor = cast(Extractor, self.extractor)
-        projection = self._known_projection
+        projection = self.known_projection
         images = CachedPixels(CachedTensors(self._store, missing), projection)
         dataset = PointDataset(missing, self.sensor, extractor.prepare, images)
         stores = {self.grid_size: grids}

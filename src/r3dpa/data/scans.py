@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from glob import has_magic
 from multiprocessing.pool import ThreadPool
@@ -185,14 +185,13 @@ def _drive_name(folder: Path, root: Path) -> str:
     return "/".join(parts) or root.name
 
 
-def check(path: str | Path, further: Mapping[Path, ScanError] | None = None) -> tuple[str, bool]:
+def check(path: str | Path) -> tuple[str, bool]:
     """Text about every scan of a data set, folder or file, and whether nothing is wrong with it.
 
     A folder with folders of KITTI-360 is compared with its layout and nine LiDAR drives; a
     simulated one with its manifest (``ValueError`` if that is damaged).
     Every scan needs 16 points, ranges in metres, and a point within the range limits of
-    :class:`LidarSensor`. ``further`` are errors of scans by their resolved path, which are listed
-    where nothing else is wrong with the scan.
+    :class:`LidarSensor`; a file of labels beside it needs one for each point.
     """
     root, sensor = Path(path).absolute(), LidarSensor()
     scans = find_scans(root) if any(scan_files(root)) else []
@@ -206,11 +205,9 @@ def check(path: str | Path, further: Mapping[Path, ScanError] | None = None) -> 
 
     def examine(scan: Scan) -> tuple[float, float] | str:
         try:
-            cloud = read_cloud(scan.path, scan.columns, with_labels=False)
+            cloud = read_cloud(scan.path, scan.columns)
             cloud.check_metres()
             intensity = rows_of(scan.path, cloud, sensor)[:, 3]
-            if further and (error := further.get(scan.path.resolve())):
-                raise error
         except ScanError as error:
             return f"bad: {error}"
         return float(intensity.min()), float(intensity.max())

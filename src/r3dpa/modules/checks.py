@@ -7,11 +7,9 @@ from typing import Any
 
 from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.geometry import (
-    Projection,
     RangeCodec,
     RingProjection,
     ScanGeometry,
-    SphericalProjection,
 )
 from r3dpa.nn import VAE, ImageVAE, VelocityNetwork
 
@@ -65,10 +63,7 @@ def planned_geometry(datamodule: object) -> ScanGeometry | None:
             f"{error}: set --data.init_args.grid_size, or beams and columns of "
             "--data.init_args.sensor, so that it does"
         ) from None
-    projection: Projection = SphericalProjection(sensor)
-    if datamodule.projection_kind == "beams" and datamodule.beams is not None:
-        projection = datamodule.beams
-    return ScanGeometry(projection, datamodule.codec, grid_size)
+    return ScanGeometry(datamodule.known_projection, datamodule.codec, grid_size)
 
 
 def check_same_images(here: ScanGeometry, recorded: ScanGeometry, source: str) -> None:
