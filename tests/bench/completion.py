@@ -70,7 +70,9 @@ class Candidates:
         """Latents after some steps of Adam on the error of the decoded known pixels."""
         codec = self.generator.geometry.codec.without_further()
         image = codec.to_image(range_m)
-        known = ~missing & codec.informative(image)
+        known = (~missing).expand_as(image).clone()
+        if codec.return_channel:
+            known[:1] &= codec.returns_of(image)  # elsewhere the range is arbitrary
         with torch.enable_grad():
             fitted = latents.clone().requires_grad_()
             adam = torch.optim.Adam([fitted], lr=FIT_RATE)

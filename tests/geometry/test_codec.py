@@ -117,9 +117,6 @@ def test_intensity_and_class_survive_the_round_trip():
     assert found.intensity.tolist() == [[0.0, 0.0, 1.0, 0.25]]
     assert found.classes.tolist() == [[0, UNKNOWN_CLASS, NUM_CLASSES - 1, UNKNOWN_CLASS]]
     assert torch.equal(codec.returns_of(image), range_m[None] > 0)
-    # Of an empty pixel neither range nor intensity matter; numbers of classes have no distance.
-    assert codec.informative(image)[:, 0, 1].tolist() == [False, True, False, False]
-    assert codec.informative(image)[:, 0, 0].tolist() == [True, True, True, False]
     assert (codec.to_image(range_m, intensity)[3] == UNKNOWN_CLASS).all()  # without labels
 
 

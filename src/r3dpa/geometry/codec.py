@@ -277,20 +277,6 @@ class RangeCodec:
         dropped = (returns > _LIKELY_RETURN) & (uniform > returns)
         return image.masked_fill(dropped.unsqueeze(-3), -1.0)
 
-    def informative(self, image: Tensor) -> Tensor:
-        """Values, bool ``(..., C, H, W)``, that a decoder has to match by their difference.
-
-        No range or intensity without a return, and no number of a class.
-        """
-        informative = torch.ones_like(image, dtype=torch.bool)
-        if self.return_channel:
-            informative[..., :1, :, :] = self.returns_of(image)
-        if self.intensity_channel:
-            informative[..., 2:3, :, :] = self.returns_of(image)
-        if self.num_classes:
-            informative[..., -1:, :, :] = False
-        return informative
-
     def ranges_of(self, image: Tensor, sensor: LidarSensor) -> Tensor:
         """Ranges ``(..., H, W)`` of images ``(..., C, H, W)``, see :meth:`decode`."""
         range_m = self.decode(image[..., 0, :, :], sensor)
