@@ -87,23 +87,11 @@ class Interpolant:
             return x - time * velocity
         return self.coefficients(time).data_and_noise(x, velocity)[0]
 
-    def score(self, velocity: Tensor, x: Tensor, time: Tensor) -> Tensor:
-        """Gradient of the log density at times above 0; for inspection only.
-
-        Formula: linear ``(-(1 - t) v - x) / t``; cosine ``-(2 / pi) cot(pi t / 2) v - x``. Not
-        finite at t = 0; samplers use :meth:`sde_drift`.
-        """
-        time = per_sample(time, x)
-        if self.path == "linear":
-            return (-(1 - time) * velocity - x) / time
-        alpha, sigma, _, _ = self.coefficients(time)
-        return -(2 / math.pi) * (alpha / sigma) * velocity - x
-
     def sde_drift(self, velocity: Tensor, x: Tensor, time: Tensor) -> Tensor:
         """Drift ``v - t score`` of the SDE with diffusion ``w = 2 t``, finite on [0, 1].
 
-        Formula, without the division: linear ``(2 - t) v + x``; cosine
-        ``(1 + (4 / pi^2) u cot(u)) v + t x`` with ``u = pi t / 2``.
+        The score is the gradient of the log density. Formula, without the division by t: linear
+        ``(2 - t) v + x``; cosine ``(1 + (4 / pi^2) u cot(u)) v + t x`` with ``u = pi t / 2``.
         """
         time = per_sample(time, x)
         if self.path == "linear":
