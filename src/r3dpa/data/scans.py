@@ -119,16 +119,18 @@ def kitti360_scans(root: str | Path, split: Split) -> list[Scan]:
     Absent drives are skipped; ``ValueError`` if both splits are empty.
     """
     raw = Path(root).absolute() / RAW
-    scans = {
-        part: [Scan(name, file.stem, file) for name in drives for file in _drive_files(raw / name)]
-        for part, drives in KITTI360_DRIVES.items()
-    }
-    if not any(scans.values()):
+    scans = [
+        Scan(drive, file.stem, file)
+        for drive in KITTI360_DRIVES[split]
+        for file in _drive_files(raw / drive)
+    ]
+    others = KITTI360_DRIVES["val" if split == "train" else "train"]
+    if not scans and not any(any(_drive_files(raw / drive)) for drive in others):
         raise ValueError(
             f"no scan of the {split} split in {root}, nor of the other one: `r3dpa data check "
             f"{root}` names what is missing; use LidarDataModule for scans in other folders"
         )
-    return sorted(scans[split])
+    return sorted(scans)
 
 
 def evenly(items: Sequence[T], num: int | None) -> list[T]:
