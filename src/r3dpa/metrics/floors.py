@@ -59,25 +59,11 @@ def measure_floors(
     Returns:
         Rows by name, without intervals; empty where a half has fewer than two scans.
     """
-    key = (tuple(metric_names), num_samples, num_images, resampling)
-    if key not in reference.floors:
-        rows = _rows_between_halves(
-            reference, spaces, metric_names, num_samples, num_images, resampling
-        )
-        reference.floors[key] = {row.name: row for row in rows}
-    return reference.floors[key]
-
-
-def _rows_between_halves(
-    reference: ReferenceStatistics,
-    spaces: Sequence[str],
-    metric_names: Sequence[str],
-    num_samples: int,
-    num_images: int,
-    resampling: Resampling,
-) -> list[MetricResult]:
     if min(reference.sizes_of_halves) < 2:
-        return []
+        return {}
+    key = (tuple(metric_names), num_samples, num_images, resampling)
+    if key in reference.floors:
+        return reference.floors[key]
     collection = reference.metrics(spaces, max_images=(None, num_images))
     metrics = metrics_by_name(collection)
     first, second = map(metrics_by_name, reference.halves)
@@ -102,7 +88,9 @@ def _rows_between_halves(
 
     without_intervals = replace(resampling, num_resamples=0)
     metrics = metrics_by_name(collection)  # shares the states within each feature space
-    return [row for name in metric_names for row in metrics[name].results(without_intervals)]
+    rows = [row for name in metric_names for row in metrics[name].results(without_intervals)]
+    reference.floors[key] = {row.name: row for row in rows}
+    return reference.floors[key]
 
 
 def add_floor(row: MetricResult, floors: Floors) -> MetricResult:
