@@ -14,8 +14,8 @@ from torch import Tensor, nn
 from r3dpa.checkpoints.networks import AVERAGES, Checkpoint, NetworkState
 from r3dpa.checkpoints.transfer import TransferRow
 from r3dpa.nn import VAE, SiT
+from r3dpa.nn.layers import Size
 
-Size = tuple[int, int]
 _POSITIONS = "pos_embed"
 _INPUTS = ("encoder.conv_in.weight", "encoder.further_in.weight")
 _OUTPUTS = (

@@ -16,7 +16,7 @@ from einops import rearrange
 from torch import Tensor, nn
 
 from r3dpa.features.official import load_strictly, read_released
-from r3dpa.nn.layers import Mlp, SelfAttention
+from r3dpa.nn.layers import Mlp, SelfAttention, Size
 
 _HEAD_WIDTH = 64  # of every released ViT
 _MLP_RATIO = 4
@@ -26,8 +26,6 @@ _EPS = 1e-6
 # Mean and deviation of red, green and blue in [0, 1] on ImageNet.
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
-
-Size = tuple[int, int]
 
 
 class TransformerTrunk(nn.Module):

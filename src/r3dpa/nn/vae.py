@@ -22,6 +22,7 @@ from r3dpa.nn.layers import (
     Float32CircularConv2d,
     GroupNorm,
     ResBlock,
+    Size,
     Upsample,
     at_least_float32,
     downsample,
@@ -34,7 +35,6 @@ from r3dpa.nn.pixel_outputs import (
     without_ripples,
 )
 
-Size = tuple[int, int]
 # AdamW moves a weight by at most the learning rate per step: without this gain, logits need
 # hundreds of steps to learn even the class frequencies.
 _LOGIT_GAIN = 8.0

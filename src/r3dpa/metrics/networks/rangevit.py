@@ -23,6 +23,7 @@ from r3dpa.features.official import (
     read_state_dict,
 )
 from r3dpa.geometry import EMPTY_RANGE_M, LidarSensor, SphericalProjection, unproject
+from r3dpa.nn.layers import Size
 
 _NORM_EPS = 1e-5
 # Mean and deviation of range, x, y, z in metres and intensity on KITTI-360, of valeoai/R3DPA.
@@ -42,8 +43,6 @@ _NAMES = {
     "output.": f"{_DECODER}conv_output.",
 }
 _CLASSIFIER = "rangevit.kpclassifier."  # works on points, behind the features
-
-Size = tuple[int, int]
 
 
 class RangeViT(FrozenNetwork):
