@@ -33,11 +33,16 @@ def encode(tmp_path):
     trainer = SimpleNamespace(
         datamodule=loaders, strategy=strategy, global_rank=0, world_size=1, num_devices=1
     )
-    module = SimpleNamespace(trainer=trainer, device=torch.device("cpu"), latent_shape=(4, 4, 8))
+    module = SimpleNamespace(
+        trainer=trainer,
+        device=torch.device("cpu"),
+        latent_shape=(4, 4, 8),
+        latents_dir=str(tmp_path),
+    )
 
     def run(vae, settings, given):
         module.vae = vae
-        cached = cache_posteriors(module, tmp_path, settings, given, Images, "image")
+        cached = cache_posteriors(module, settings, given, Images, "image")
         rows = list(tmp_path.glob("*/*.rows"))
         return torch.stack([cached.read(item) for item in given]), len(rows)
 
@@ -72,6 +77,6 @@ def test_posteriors_of_scans_depend_on_projection_and_codec(monkeypatch, tmp_pat
         datamodule=data, default_root_dir=tmp_path, fast_dev_run=False
     )
     FlowMatching.on_fit_start(module)
-    ((_, _, settings, *_),) = found
+    ((_, settings, *_),) = found
     geometry = TinyData.geometry.to_dict()
     assert settings == {"projection": geometry["projection"], "codec": geometry["codec"]}

@@ -21,7 +21,6 @@ Item = TypeVar("Item", bound=Cacheable)
 @torch.no_grad()
 def cache_posteriors(
     module: Any,
-    root: Path,
     settings: Mapping[str, Any],
     items: Sequence[Item],
     dataset_of: Callable[[list[Item]], Dataset[Any]],
@@ -29,11 +28,11 @@ def cache_posteriors(
 ) -> CachedTensors[Item]:
     """Cache posterior moments ``(2C, h, w)``; encodes only the items that the cache lacks.
 
-    They are computed in float32 whatever the precision of the steps.
+    They are computed in float32 whatever the precision of the steps, and kept in the
+    ``latents_dir`` of the module; in ``<run_dir>/latents`` where that is None.
 
     Args:
         module: In training, on its device; has a frozen ``vae`` and ``latent_shape`` (C, h, w).
-        root: Folder of caches.
         settings: What the moments depend on beside the weights of the VAE, as JSON values.
         items: Scans or images, the same in all processes, which share the work.
         dataset_of: Dataset of some items, whose samples hold their ``index`` and an image.
@@ -42,7 +41,8 @@ def cache_posteriors(
     Raises:
         StoreError: If the cache cannot be written or is damaged, or moments are not finite.
     """
-    datamodule = module.trainer.datamodule
+    trainer, datamodule = module.trainer, module.trainer.datamodule
+    root = Path(module.latents_dir or Path(trainer.default_root_dir) / "latents")
     channels, *size = module.latent_shape
     about = {**settings, "vae": weights_sha256(module.vae.state_dict())}
     cache = tensor_cache(root, "posterior", about, (2 * channels, *size))
@@ -53,7 +53,7 @@ def cache_posteriors(
             posterior = module.vae.encode(batch[image].to(module.device))
             yield torch.cat([posterior.mean, posterior.logvar], dim=1)
 
-    return fill_cache(module.trainer, cache, items, moments_of)
+    return fill_cache(trainer, cache, items, moments_of)
 
 
 def fill_cache(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, cast
 
 import torch
@@ -112,7 +111,6 @@ class FlowMatching(GenerativeModule):
         geometry = self.scan_geometry.to_dict()
         posteriors = cache_posteriors(
             self,
-            Path(self.latents_dir or Path(self.trainer.default_root_dir) / "latents"),
             {"projection": geometry["projection"], "codec": geometry["codec"]},
             list(dict.fromkeys(dataset.scans)),
             lambda scans: replace(dataset, scans=scans, grids=None),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any, Literal, cast
 
 import torch
@@ -135,7 +134,6 @@ class RGBPretraining(ImageStage):
             entries = entries[: batches * datamodule.batch_size * trainer.world_size]
         return cache_posteriors(
             self,
-            Path(self.latents_dir or Path(trainer.default_root_dir) / "latents"),
             {"images": datamodule.settings},
             entries,
             lambda some: ImageDataset(datamodule.source, some, datamodule.image_size),
