@@ -6,7 +6,7 @@ pitch, so that z points straight up. Letters: N solids, H beams, W shots.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,13 +73,6 @@ def solids_of(primitives: tuple[Primitive, ...], pose: Pose, ground_m: float) ->
         slats=np.array([p.slats + p.open_m for p in primitives], dtype=np.float32).reshape(-1, 4),
         ground_m=ground_m - pose.z_m,
     )
-
-
-def subset(solids: Solids, chosen: NDArray) -> Solids:
-    """Some of the solids, by mask or index, over the same ground."""
-    columns: dict[str, Any] = solids._asdict()
-    del columns["ground_m"]
-    return solids._replace(**{name: column[chosen] for name, column in columns.items()})
 
 
 def level(vectors: Floats, pose: Pose) -> Floats:
