@@ -301,7 +301,7 @@ class RecordedSweep(Sweep):
         step = np.float32(self.scale.step)
         return np.round(values / step) * step if step else values
 
-    def rays_near(self, solids: Solids, actor_time_s: Floats | None) -> list[NDArray[np.int64]]:
+    def rays_near(self, solids: Solids) -> list[NDArray[np.int64]]:
         """All rays for each solid."""
         return [np.arange(self.num_rays)] * len(solids.shape)
 

@@ -164,29 +164,19 @@ class Sweep:
         towards += self.start.take(rays, axis=1)
         return towards
 
-    def rays_near(self, solids: Solids, actor_time_s: Floats | None) -> list[NDArray[np.int64]]:
-        """Rays (M,) that can meet each solid, from its bounding box.
-
-        ``actor_time_s``: ``(R,)`` when they meet moving ones; None in the middle of the sweep.
-        """
+    def rays_near(self, solids: Solids) -> list[NDArray[np.int64]]:
+        """Rays (M,) that can meet each solid where it is at their time, from its bounding box."""
         near = [np.empty(0, dtype=np.int64)] * len(solids.shape)
         if not near:
             return near
         start, direction = self.grid(self.start), self.grid(self.direction)
-        time_s = None if actor_time_s is None else self.grid(actor_time_s)
-        windows = windows_of(solids, start, direction, self.sensor.max_range_m, time_s)
+        limit_m, time_s = self.sensor.max_range_m, self.grid(self.time_s)
+        windows = windows_of(solids, start, direction, limit_m, time_s)
         every_ray = self.grid(np.arange(self.num_rays))
         for index in windows.order:
             parts = pieces(index, windows, self.shape[1])
             near[index] = np.concatenate([every_ray[part].ravel() for part in parts])
         return near
-
-    def all_near(self, solids: Solids, actor_time_s: Floats | None) -> NDArray[np.int64]:
-        """Rays (M,) that can meet any of these solids, see ``rays_near``."""
-        inside = np.zeros(self.num_rays, dtype=bool)
-        for rays in self.rays_near(solids, actor_time_s):
-            inside[rays] = True
-        return np.flatnonzero(inside)
 
     def of_surface(
         self,

@@ -155,7 +155,7 @@ class Spray(Effect):
         """Rays whose window meets a plume."""
         scene = sweep.scene
         boxes = solids_of(_plumes(scene), scene.pose, scene.ground_m)
-        return sweep.all_near(boxes, sweep.time_s)
+        return np.unique(np.concatenate(sweep.rays_near(boxes)))
 
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
         sensor = sweep.sensor
@@ -164,7 +164,7 @@ class Spray(Effect):
         solids = solids_of(boxes, scene.pose, scene.ground_m)
         flooded = scene.weather.water_film_mm / 1.2
         drawn = draws.uniform(slice(None))
-        for index, window in enumerate(sweep.rays_near(solids, sweep.time_s)):
+        for index, window in enumerate(sweep.rays_near(solids)):
             chosen, start = _around(solids, index, sweep, window)
             enter, leave = surface_distance(
                 solids, np.full(len(chosen), index), start, sweep.direction[:, chosen]
