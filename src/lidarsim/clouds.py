@@ -324,25 +324,17 @@ def read_cloud(
         raise ScanError(f"{path}: {reason}") from error
     names = _known_columns(path, table)
     labels, label_path = _labels(path, len(table)) if with_labels else (None, None)
-    finite = _finite_rows(table, names)
-    if finite is not None:
-        if not drop_nan:
-            num_bad = np.count_nonzero(~finite)
-            raise ScanError(
-                f"{path}: has NaN or infinite values in {num_bad} of {len(table)} points; "
-                "`r3dpa data convert SCANS OUT --to bin --drop_nan true` leaves them out"
-            )
-        table, labels = table[finite], None if labels is None else labels[finite]
-    file = CloudFile(path, kind, pack, data if finite is None else None, label_path)
-    return PointCloud(table, names, labels, file)
-
-
-def _finite_rows(table: Table, names: Mapping[str, str]) -> NDArray[np.bool_] | None:
-    """Return a mask ``(P,)`` of the rows whose known columns are finite; None if all are."""
-    finite = np.ones(len(table), dtype=bool)
-    for name in names.values():
-        finite &= np.isfinite(table[name])
-    return None if finite.all() else finite
+    is_finite = np.all([np.isfinite(table[name]) for name in names.values()], axis=0)
+    if is_finite.all():
+        return PointCloud(table, names, labels, CloudFile(path, kind, pack, data, label_path))
+    if not drop_nan:
+        raise ScanError(
+            f"{path}: has NaN or infinite values in {np.count_nonzero(~is_finite)} of {len(table)} "
+            "points; `r3dpa data convert SCANS OUT --to bin --drop_nan true` leaves them out"
+        )
+    labels = None if labels is None else labels[is_finite]
+    file = CloudFile(path, kind, pack, None, label_path)
+    return PointCloud(table[is_finite], names, labels, file)
 
 
 def write_cloud(path: str | Path, cloud: PointCloud, full_scale: float | None = None) -> None:
