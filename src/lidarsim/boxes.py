@@ -63,13 +63,9 @@ def _line(parts: list[Primitive], sensor_to_world: NDArray[np.float64]) -> str:
     rotation, place = sensor_to_world[:, :3], sensor_to_world[:, 3]
     x, y, z = (bottom - place) @ rotation
     ahead = turn[:, 0] @ rotation  # of the object, in the sensor frame
-    rotation_y = _wrap_angle(-math.atan2(ahead[1], ahead[0]) - math.pi / 2)
-    alpha = _wrap_angle(rotation_y - math.atan2(-y, x))
+    # Both angles lie in [-pi, pi].
+    rotation_y = math.remainder(-math.atan2(ahead[1], ahead[0]) - math.pi / 2, math.tau)
+    alpha = math.remainder(rotation_y - math.atan2(-y, x), math.tau)
     numbers = (height, width, length, -y, -z, x, rotation_y)
     kind = KITTI_TYPES[parts[0].semantic]
     return f"{kind} 0.00 3 {alpha:.2f} -1 -1 -1 -1 {' '.join(f'{v:.2f}' for v in numbers)}"
-
-
-def _wrap_angle(angle_rad: float) -> float:
-    """Return the angle wrapped to [-pi, pi]."""
-    return math.remainder(angle_rad, 2 * math.pi)
