@@ -99,7 +99,8 @@ class DriveFiles:
 
     def summaries(self, count: int) -> list[dict[str, Any]]:
         """Contents of ``sim/*.json`` of the first ``count`` scans; errors name a damaged file."""
-        return [self._summary(self._path("sim", number)) for number in range(count)]
+        advice = "delete it and simulate again, which completes the data set"
+        return [read_json(self._path("sim", number), advice) for number in range(count)]
 
     def write_times_and_poses(self, summaries: Sequence[dict[str, Any]]) -> None:
         """Write ``timestamps.txt`` and ``velodyne_to_world.txt`` of all scans, in order."""
@@ -122,15 +123,6 @@ class DriveFiles:
 
     def _path(self, kind: str, number: int) -> Path:
         return self.points_folder / kind / f"{_stem(number)}{_SUFFIXES[kind]}"
-
-    def _summary(self, path: Path) -> dict[str, Any]:
-        try:
-            return dict(json.loads(path.read_text()))
-        except ValueError as error:
-            raise ValueError(
-                f"{path} is damaged ({error}): delete it and simulate again, which completes the "
-                "data set"
-            ) from error
 
 
 def drive_name(number: str) -> str:
@@ -166,6 +158,17 @@ def weather_to_dict(weather: Conditions) -> dict[str, Any]:
 def to_json(values: Any) -> bytes:
     """Plain values and NumPy scalars as the bytes of a JSON file."""
     return f"{json.dumps(values, indent=1, allow_nan=False, default=np.generic.item)}\n".encode()
+
+
+def read_json(path: Path, advice: str) -> dict[str, Any]:
+    """Object of a JSON file; ``ValueError`` with advice if the file is damaged."""
+    try:
+        values = json.loads(path.read_text())
+        if not isinstance(values, dict):
+            raise ValueError(f"it holds {type(values).__name__}, not an object")
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is damaged ({error}): {advice}") from error
+    return values
 
 
 def write(path: Path, content: bytes) -> None:

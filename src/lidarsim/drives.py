@@ -12,7 +12,6 @@ interruptions.
 
 from __future__ import annotations
 
-import json
 import os
 import statistics
 from collections import Counter
@@ -21,7 +20,14 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from lidarsim.drive_files import DriveFiles, drive_name, to_json, weather_to_dict, write
+from lidarsim.drive_files import (
+    DriveFiles,
+    drive_name,
+    read_json,
+    to_json,
+    weather_to_dict,
+    write,
+)
 from lidarsim.io import differences, in_processes, json_values, only_writer, text_table
 from lidarsim.scan import Simulator, check_switches
 from lidarsim.scene import Conditions, Semantic
@@ -34,6 +40,7 @@ VAL_SHARE = 0.2
 
 _MANIFEST = "simulation.json"
 _CLASSES = "classes.yaml"  # names of the class ids of the labels
+_START_AGAIN = "simulate the data set again into an empty folder"
 # Raised whenever the same request gives other scans than before.
 SIMULATOR_VERSION = 4
 # Neighbouring scans share their blocks of street, so a worker takes a few in a row.
@@ -220,13 +227,12 @@ def expected_scans(root: Path) -> dict[str, int] | None:
     manifest = root / _MANIFEST
     if not manifest.is_file():
         return None
-    request = _read_json(manifest)
+    request = read_json(manifest, _START_AGAIN)
     try:
         counts = split_scans(request["scans"], request["drives"])
     except (KeyError, OverflowError, TypeError, ValueError) as error:
         raise ValueError(
-            f"{manifest} does not say which scans were simulated ({error!r}); simulate the data "
-            f"set again into an empty folder"
+            f"{manifest} does not say which scans were simulated ({error!r}): {_START_AGAIN}"
         ) from error
     return {drive_name(drive): count for drive, count in sorted(counts.items())}
 
@@ -248,7 +254,7 @@ def _check_folder(out: Path, request: dict[str, Any]) -> bool:
                 f"give another folder"
             )
         return False
-    stored = _read_json(manifest)
+    stored = read_json(manifest, _START_AGAIN)
     num_stored = stored.get("scans")
     scans = request["scans"]
     same_scans = stored | ({"scans": scans} if isinstance(num_stored, int) else {})
@@ -258,18 +264,6 @@ def _check_folder(out: Path, request: dict[str, Any]) -> bool:
             f"folder, or delete it"
         )
     return isinstance(num_stored, int) and num_stored > scans
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        values = json.loads(path.read_text())
-        if not isinstance(values, dict):
-            raise ValueError(f"it holds {type(values).__name__}, not an object")
-    except (ValueError, RecursionError) as error:
-        raise ValueError(
-            f"{path} is damaged ({error}); simulate the data set again into an empty folder"
-        ) from error
-    return values
 
 
 def _run(task: _Task) -> int:

@@ -232,9 +232,10 @@ def test_after_a_failure_waiting_tasks_do_not_run(tmp_path, monkeypatch):
     assert len(list((folder / "data").iterdir())) < 20
 
 
-def test_a_damaged_summary_is_named_and_made_again_when_deleted(tmp_path, before):
+@pytest.mark.parametrize("text", ['{"drive": "0003", "scan', "null", "[" * 100_000])
+def test_a_damaged_summary_is_named_and_made_again_when_deleted(tmp_path, before, text):
     summary = points_folder(tmp_path, "0003") / "sim" / "0000000001.json"
-    summary.write_text('{"drive": "0003", "scan')
+    summary.write_text(text)
     with pytest.raises(ValueError, match=r"sim/0000000001\.json is damaged .* delete it"):
         simulate(tmp_path, 2, drives=["0003"], **SMALL)
     summary.unlink()
