@@ -6,6 +6,7 @@ import pytest
 from lidarsim import Material, Semantic, Shape
 from lidarsim.street import furniture, people, vehicles, works
 from lidarsim.street.builder import Builder, Strip
+from lidarsim.street.buildings import Front
 from lidarsim.street.course import BLOCK_M, Kerb, course_of
 
 # A street without bends and slopes, whose sides are pavements: x is s, y the lateral distance.
@@ -80,7 +81,7 @@ PLACED = {
         {Semantic.SMALL_POLE},
     ),
     "scaffolding": (
-        lambda builder, draw: works.scaffolding(builder, draw, -1.0, S - 6, S + 6, 9.0, 8.0),
+        lambda builder, draw: works.scaffolding(builder, draw, Front(-1.0, S - 6, S + 6, 9.0), 8.0),
         {Semantic.UNKNOWN_CONSTRUCTION},
     ),
 }  # fmt: skip

@@ -192,9 +192,7 @@ def shed(builder: Builder, draw: Generator, s: float, lateral: float) -> None:
     """A garden shed of wood, 2 to 3.5 m wide and high."""
     look = (Semantic.BUILDING, Material.WOOD, draw.uniform(0.1, 0.2), builder.new_instance())
     size = (draw.uniform(2.0, 3.5), draw.uniform(1.8, 3.0), draw.uniform(2.0, 2.8) + FOOTING_M)
-    builder.solid(
-        Shape.BOX, (s, lateral), size, *look, -FOOTING_M, draw.uniform(-0.2, 0.2)
-    )  # fmt: skip
+    builder.solid(Shape.BOX, (s, lateral), size, *look, -FOOTING_M, draw.uniform(-0.2, 0.2))
 
 
 def hall(builder: Builder, draw: Generator, front: Front) -> None:

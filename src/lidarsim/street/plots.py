@@ -52,7 +52,7 @@ def _town(builder: Builder, draw: Generator, start: float, side: float, edge_m: 
             front = Front(side, s, last, front_m)
             building(builder, draw, front, draw.uniform(8, 12), 12.0)
             if draw.random() < 0.06:
-                scaffolding(builder, draw, side, s, last, front_m, 6.0)
+                scaffolding(builder, draw, front, 6.0)
         elif kind < 0.85:
             front_m = edge_m + draw.uniform(2.0, 4.5)
             front = Front(side, s, last, front_m)

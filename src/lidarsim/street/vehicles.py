@@ -208,10 +208,8 @@ def car(draw: Generator) -> Body:
     # The cabin reaches over the bonnet where the windscreen is raked.
     cabin_long = foot - (rear + boot_m) + 0.3 * (not build.upright)
     at = rear + boot_m + cabin_long / 2
-    if build.upright:
-        parts += _upright_cabin(draw, painted, at, belt_m, (cabin_long, 0.92 * width, height))
-    else:
-        parts += _raked_cabin(draw, painted, at, belt_m, (cabin_long, 0.92 * width, height))
+    cabin = _upright_cabin if build.upright else _raked_cabin
+    parts += cabin(draw, painted, at, belt_m, (cabin_long, 0.92 * width, height))
     parts += _wheels(Semantic.CAR, width, front - 0.85, rear + 0.75)
     parts += [
         _mirrors(Semantic.CAR, foot - 0.15, belt_m + 0.05, width),

@@ -9,6 +9,7 @@ from numpy.random import Generator
 
 from lidarsim.scene import Material, Semantic, Shape
 from lidarsim.street.builder import Builder, Strip
+from lidarsim.street.buildings import Front
 
 # Site fences: panels of mesh of 3.5 m x 2.0 m on feet of concrete; a panel holds up about every
 # fourth beam: 6 cm of it, with this chance per metre.
@@ -35,9 +36,9 @@ def building_site(builder: Builder, draw: Generator, strip: Strip) -> None:
     side, first, last, near_m, far_m = strip
     middle_m = (near_m + far_m) / 2
     if draw.random() < 0.6:
-        _mesh_fence(builder, draw, side, first, last, near_m)
+        _mesh_fence(builder, draw, strip)
     else:
-        _barriers(builder, draw, side, first, last, near_m)
+        _barriers(builder, draw, strip)
     deep_m = far_m - near_m
     places = list(np.arange(first + 3.3, last - 3.2, 5.0))
     draw.shuffle(places)
@@ -52,19 +53,12 @@ def building_site(builder: Builder, draw: Generator, strip: Strip) -> None:
             _pallets(builder, draw, at[0] + draw.uniform(-1.5, 1.5), side * (near_m + 0.8))
 
 
-def scaffolding(
-    builder: Builder,
-    draw: Generator,
-    side: float,
-    first: float,
-    last: float,
-    front_m: float,
-    height_m: float,
-) -> None:
-    """A scaffold before a facade at the distance ``front_m``: two rows of standards, decks, rails.
+def scaffolding(builder: Builder, draw: Generator, front: Front, height_m: float) -> None:
+    """A scaffold before a facade: two rows of standards, decks, rails.
 
     One in three has a net before it, from the first deck up.
     """
+    side, first, last, front_m = front
     instance = builder.new_instance()
     tube = (Semantic.UNKNOWN_CONSTRUCTION, *_STEEL, instance)
     bays = max(1, int((last - first) / _BAY_M))
@@ -90,10 +84,9 @@ def scaffolding(
         builder.solid(Shape.BOX, at, size, *net, _STOREY_M, extinction_per_m=_NET_PER_M)
 
 
-def _mesh_fence(
-    builder: Builder, draw: Generator, side: float, first: float, last: float, near_m: float
-) -> None:
+def _mesh_fence(builder: Builder, draw: Generator, strip: Strip) -> None:
     """Panels of mesh between posts, not quite in line, one of them sometimes open."""
+    side, first, last, near_m, _ = strip
     for s in np.arange(first + _PANEL_M / 2, last - _PANEL_M / 2 + 0.1, _PANEL_M):
         instance = builder.new_instance()
         at = (float(s), side * near_m + draw.normal(0, 0.1))
@@ -112,10 +105,9 @@ def _mesh_fence(
         builder.solid(Shape.BOX, foot_at, size, *concrete, detail=True)
 
 
-def _barriers(
-    builder: Builder, draw: Generator, side: float, first: float, last: float, near_m: float
-) -> None:
+def _barriers(builder: Builder, draw: Generator, strip: Strip) -> None:
     """Boards on posts along the road with cones before them."""
+    side, first, last, near_m, _ = strip
     for s in np.arange(first + 1.1, last - 1.0, 2.2):
         instance = builder.new_instance()
         lateral = side * near_m + draw.normal(0, 0.05)
