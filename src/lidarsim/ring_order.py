@@ -39,13 +39,13 @@ def rings_in_order(
     ring = turn.cumsum()
     ring = ring - ring.min()
     counts = np.bincount(ring)
-    stray = counts < _STRAY_SHARE * _lower_median(counts)
+    stray = counts < _STRAY_SHARE * np.quantile(counts, 0.5, method="lower")
     ring = ((~stray).cumsum() - 1).clip(min=0)[ring]  # strays join the ring before them
     num_rings = int(ring.max()) + 1
 
     mean = _mean_per_ring(inclination, ring)
     variance = _mean_per_ring(np.square(inclination - mean[ring]), ring)
-    spread = math.sqrt(_lower_median(variance))
+    spread = math.sqrt(np.quantile(variance, 0.5, method="lower"))
     # Inclinations spread evenly over the field of view have a deviation of 0.29 times it.
     if spread > sensor.field_of_view_rad / 6:
         deviation_deg = math.degrees(spread)
@@ -66,8 +66,3 @@ def not_in_ring_order(reason: str, sensor: LidarSensor) -> ValueError:
 def _mean_per_ring(values: NDArray[np.float64], ring: NDArray[np.int64]) -> NDArray[np.float64]:
     """Mean ``(R,)`` of values ``(P,)`` per ring; every ring in ``[0, R)`` has a return."""
     return np.bincount(ring, values) / np.bincount(ring)
-
-
-def _lower_median(values: NDArray[np.int64] | NDArray[np.float64]) -> float:
-    """Median, the lower of the two middle values of an even number."""
-    return float(np.sort(values)[(len(values) - 1) // 2])
