@@ -1,4 +1,4 @@
-"""Field of view and limits of a range image; ranges and angles of points."""
+"""Field of view and limits of a range image; angles and pixels of points."""
 
 from __future__ import annotations
 
@@ -112,14 +112,10 @@ class LidarSensor:
         return self.inclination_max_rad - math.radians(self.inclination_min_deg)
 
 
-def range_of(points: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Distance from the sensor of points ``(..., 3)``, correctly rounded."""
-    return np.sqrt(np.square(points.astype(np.float64)).sum(axis=-1)).astype(np.float32)
-
-
 def in_range(points: NDArray[np.floating], sensor: LidarSensor) -> NDArray[np.bool_]:
     """Whether each point of ``(..., 3)`` is finite and strictly inside the range limits."""
-    range_m = range_of(points)
+    # Correctly rounded to float32.
+    range_m = np.sqrt(np.square(points.astype(np.float64)).sum(axis=-1)).astype(np.float32)
     return (range_m > sensor.range_min_m) & (range_m < sensor.range_max_m)
 
 
