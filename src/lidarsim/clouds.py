@@ -337,26 +337,26 @@ def read_cloud(
     return PointCloud(table[is_finite], names, labels, file)
 
 
-def write_cloud(path: str | Path, cloud: PointCloud, full_scale: float | None = None) -> None:
+def write_cloud(path: str | Path, cloud: PointCloud) -> None:
     """Write a cloud in the format of the suffix, atomically.
 
     In the format of its own file, every column is written as it was read. ``.bin`` takes x, y, z
-    and the intensity as a share of ``full_scale``, ``.pcd.bin`` 255 times the share and the ring.
+    and the share of the intensity, ``.pcd.bin`` 255 times the share and the ring.
 
     Raises:
         ScanError: If the format cannot be written, or cannot hold the cloud.
     """
-    write_bytes(path, packed(Path(path), cloud, full_scale))
+    write_bytes(path, packed(Path(path), cloud))
 
 
-def packed(path: Path, cloud: PointCloud, full_scale: float | None = None) -> bytes:
+def packed(path: Path, cloud: PointCloud) -> bytes:
     """Return the content of a file of a cloud, see :func:`write_cloud`."""
     suffix, file = suffix_of(path), cloud.file
-    if file is not None and suffix_of(file.path) == suffix and full_scale is None:
+    if file is not None and suffix_of(file.path) == suffix:
         return file.pack(cloud.table) if file.data is None else file.data
     if suffix not in WRITERS:
         raise ScanError(f"{path}: cannot be written; choose from {', '.join(WRITERS)}")
-    return WRITERS[suffix](cloud, full_scale)
+    return WRITERS[suffix](cloud, None)
 
 
 def _kitti_of(cloud: PointCloud, full_scale: float | None) -> bytes:
