@@ -90,23 +90,15 @@ def _refuse_existing(target: Path) -> None:
 def _content(cloud: PointCloud, suffix: str, full_intensity: float | None) -> bytes:
     cloud.check_metres()
     if suffix == ".pcd.bin" and cloud.ring is None:
-        cloud = with_rings(cloud)
+        rings = rings_of(recorded_scan(cloud))
+        if rings.sure < _LEAST_SURE:
+            raise ScanError(
+                f"{cloud.where}: has no column ring, and only {rings.sure:.0%} of its points are "
+                "sure of one: give another --to"
+            )
+        # Counted from the lowest, as in nuScenes.
+        cloud = cloud.with_column("ring", rings.num_rings - 1 - rings.ring)
     return WRITERS[suffix](cloud, full_intensity)
-
-
-def with_rings(cloud: PointCloud) -> PointCloud:
-    """Return a cloud with the ring of each point, counted from the lowest as in nuScenes.
-
-    Raises:
-        ScanError: If the scan does not show its rings.
-    """
-    rings = rings_of(recorded_scan(cloud))
-    if rings.sure < _LEAST_SURE:
-        raise ScanError(
-            f"{cloud.where}: has no column ring, and only {rings.sure:.0%} of its points are sure "
-            "of one: give another --to"
-        )
-    return cloud.with_column("ring", rings.num_rings - 1 - rings.ring)
 
 
 def _stem(path: Path) -> str:
