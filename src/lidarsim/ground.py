@@ -71,15 +71,20 @@ def ground_around(points: NDArray[np.floating]) -> NDArray[np.float32] | None:
     return None if len(ground) < _FEWEST_AROUND else ground
 
 
+def plane_of(points: NDArray[np.float32]) -> Plane:
+    """Plane of least squares of points ``(P, 3)``."""
+    columns = np.column_stack([points[:, :2].astype(float), np.ones(len(points))])
+    return np.linalg.lstsq(columns, points[:, 2].astype(float), rcond=None)[0]
+
+
 def _plane(points: NDArray[np.float32], lowest: NDArray[np.float32], known: Plane) -> Plane:
     """Plane of the ground; ``known``, where the fit starts, if there is none."""
     plane, used = known, lowest
     for within_m in _WITHIN_M:
-        near = used[np.abs(_above(plane, used.T)) < within_m].astype(float)
+        near = used[np.abs(_above(plane, used.T)) < within_m]
         if len(near) < _LEAST_POINTS:
             return known
-        columns = np.column_stack([near[:, :2], np.ones(len(near))])
-        plane = np.linalg.lstsq(columns, near[:, 2], rcond=None)[0]
+        plane = plane_of(near)
         used = points
     steep = 1 / np.sqrt(1 + plane[0] ** 2 + plane[1] ** 2) < _LEVEL_COS
     return known if steep else plane

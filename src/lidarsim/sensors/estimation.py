@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarsim.clouds import find_files
-from lidarsim.ground import ground_around
+from lidarsim.ground import ground_around, plane_of
 from lidarsim.sensors.beams import MORE_THAN_A_TURN, BeamFit, ColumnFit, fit_beams, fit_columns
 from lidarsim.sensors.files import SensorFile, write_sensor
 from lidarsim.sensors.recordings import (
@@ -364,7 +364,7 @@ def _mount(read: Sequence[SensorScan], beams: BeamFit) -> tuple[Floats, Mount | 
     shift_m = float(np.median(height_m))
     is_shifted = abs(shift_m) > _VEHICLE_HEIGHT_M
     grounds = [ground_around(scan.cloud.points) for scan in read]
-    planes = [_plane_of(ground) for ground in grounds if ground is not None]
+    planes = [plane_of(ground) for ground in grounds if ground is not None]
     if is_shifted:
         notes.append(
             f"the beams start {shift_m:.2f} m above the origin, as in the frame of a vehicle: "
@@ -387,12 +387,6 @@ def _mount(read: Sequence[SensorScan], beams: BeamFit) -> tuple[Floats, Mount | 
         )
     pitch_deg, roll_deg = (float(np.degrees(np.arctan(slope))) for slope in slopes[:2])
     return height_m, Mount(above_m, pitch_deg, roll_deg, float(heights.std())), notes
-
-
-def _plane_of(ground: NDArray[np.float32]) -> Floats:
-    """Slopes along x and y, and height at the origin, of points ``(P, 3)`` of the ground."""
-    design = np.column_stack([ground[:, :2].astype(float), np.ones(len(ground))])
-    return np.linalg.lstsq(design, ground[:, 2].astype(float), rcond=None)[0]
 
 
 def _lasers(beams: BeamFit, columns: ColumnFit, offset: Floats, height_m: Floats) -> Lasers:
