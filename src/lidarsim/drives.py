@@ -5,9 +5,6 @@
     simulation.json                     the request
     data_3d_raw/, data_poses/           the scans and their poses, see ``drive_files``
     report.json                         what each effect did
-
-Equal requests give the same bytes, for any number of workers and after any number of
-interruptions.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Physical effects between the ray cast and the stored scan.
 
-Each effect is a frozen dataclass with its equation in the docstring. It decides from the scene
-whether it runs, selects its rays, and changes nothing else.
+Each effect is a class with its equation in the docstring, a frozen dataclass if it has parameters.
+It decides from the scene whether it runs, selects its rays, and changes nothing else.
 
 ======================================================= ============================================
 effects                                                 called for by
