@@ -393,7 +393,7 @@ def _npy_of(cloud: PointCloud, full_scale: float | None) -> bytes:
 
 def _npz_of(cloud: PointCloud, full_scale: float | None) -> bytes:
     stream, columns = io.BytesIO(), _all_columns(cloud, full_scale)
-    others: dict[str, Any] = {name: columns[name] for name in columns if name not in "xyz"}
+    others: dict[str, Any] = {name: columns[name] for name in columns if name not in {*"xyz"}}
     np.savez_compressed(stream, xyz=cloud.points, **others)
     return stream.getvalue()
 

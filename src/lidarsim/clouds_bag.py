@@ -77,7 +77,7 @@ def _cloud_of(path: Path, number: int, message: Any) -> PointCloud:
     except (KeyError, TypeError, ValueError) as error:
         raise ScanError(f"{path}: scan {number} is damaged or lacks x, y, z ({error})") from error
     finite = np.isfinite(points).all(axis=1)
-    names = [name for name in table.dtype.names or () if name not in "xyz"]
+    names = [name for name in table.dtype.names or () if name not in {*"xyz"}]
     return PointCloud.of(points[finite], **{name: table[name][finite] for name in names})
 
 

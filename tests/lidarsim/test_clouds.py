@@ -183,6 +183,16 @@ def test_an_organised_array_is_points_with_their_beam(tmp_path):
         assert arrays["pose"].tolist() == np.eye(4).tolist()
 
 
+def test_columns_named_by_two_axes_stay(tmp_path):
+    cloud = PointCloud.of(POINTS, xy=np.arange(NUM), yz=-np.arange(NUM))
+    write_cloud(tmp_path / "a.npz", cloud)
+    columns = read_cloud(tmp_path / "a.npz").columns
+    assert {name: column.tolist() for name, column in columns.items()} == {
+        "xy": list(range(NUM)),
+        "yz": [-number for number in range(NUM)],
+    }
+
+
 def test_clouds_need_numpy_alone():
     code = "import sys, lidarsim.clouds; print({'scipy', 'torch'} & set(sys.modules))"
     assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "set()"
