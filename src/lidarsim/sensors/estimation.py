@@ -144,7 +144,7 @@ def estimate_sensor(scans: Sequence[Any] | str | Path) -> SensorEstimate:
     unless the array is organised, where they are those from the direction of the column.
 
     Args:
-        scans: A scan, a folder of scans, or a sequence of files, :class:`PointCloud` or arrays:
+        scans: File or folder of scans, or a sequence of files, :class:`PointCloud` or arrays:
             ``(P, 3)``, ``(P, 4)`` with intensity, or organised ``(H, W, 3)``, 0 without return.
 
     Raises:
