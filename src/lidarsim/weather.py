@@ -180,7 +180,8 @@ class Weather(scene.Conditions):
         world = Scene(vehicles, Pose(z_m=0.0), weather=self, ground_m=-1e3, sheet_points=bright)
         sensor = instrument.sensor_for(scan)
         called = {effect_name(effect) for effect in wanted if effect.called_by(world, sensor)}
-        if not called - off.keys() - _DETECTION:
+        shows_nothing = not scan.points.any()  # points at the origin are no returns
+        if shows_nothing or not called - off.keys() - _DETECTION:
             return kept_part(scan, np.arange(len(scan)), idle)
         key = seed if isinstance(seed, tuple) else (seed,)
         sweep = RecordedSweep(world, scan, instrument, sensor, Draws(len(scan), *key, "power"))

@@ -294,6 +294,14 @@ def test_points_at_the_origin_and_single_points():
         Weather(visibility_m=30, water_film_mm=film).apply(RecordedScan(points[2:]))
 
 
+@pytest.mark.parametrize("name", ["visibility_m", "water_film_mm", "sun_elevation_deg"])
+def test_a_scan_without_a_return_stays(name):
+    recorded = RecordedScan(np.zeros((3, 3), np.float32), time_s=np.arange(3.0))
+    result = Weather(**{name: 2.0}).apply(recorded)
+    assert result.index.tolist() == [0, 1, 2]
+    assert result.report["lost"] == result.report["added"] == {}
+
+
 @pytest.mark.parametrize(
     ("extinction", "peak_m", "value"),
     [(0.005, 4.70, 4.568e-9), (0.06, 4.60, 3.816e-9), (0.2, 4.50, 2.476e-9)],
