@@ -54,7 +54,7 @@ _RANGES, _SAME_RANGE = {"range", "range_m", "range_mm", "distance", "depth"}, 0.
 # No lidar's ranges in metres have a greater median, or end before.
 _FAR_MEDIAN_M, _NEAR_MAX_M = 250.0, 1.5
 _FEWEST_POINTS = 16
-_LAS_FULL_INTENSITY = 65535.0
+_LAS_FULL_INTENSITY = 65535.0  # of 16 bits, as LAS asks for
 
 
 class CloudFile(NamedTuple):
@@ -405,7 +405,8 @@ def _las_of(cloud: PointCloud, full_scale: float | None, suffix: str = ".las") -
         raise ScanError(f"{suffix} needs laspy: pip install 'r3dpa[las]'") from error
     columns = _all_columns(cloud, None)
     if "intensity" in columns:
-        columns["intensity"] = clouds_las.intensity_of(cloud.intensity_shares(full_scale))
+        shares = cloud.intensity_shares(full_scale).clip(0, 1)
+        columns["intensity"] = np.rint(shares * _LAS_FULL_INTENSITY).astype(np.uint16)
     return clouds_las.las_of(columns, suffix)
 
 

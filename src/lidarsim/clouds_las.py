@@ -9,7 +9,6 @@ import laspy
 import numpy as np
 from numpy.typing import NDArray
 
-_FULL_INTENSITY = 65535
 _STEP_M = 1e-4
 _OWN = {"time_s": "gps_time"}
 Table = NDArray[np.void]
@@ -34,11 +33,6 @@ def read(data: bytes, suffix: str) -> tuple[Table, Callable[[Table], bytes]]:
         return _written(header, {name: table[name] for name in columns}, suffix)
 
     return table, pack
-
-
-def intensity_of(shares: NDArray[np.float32]) -> NDArray[np.uint16]:
-    """Return shares ``(P,)`` of the full scale as intensities of 16 bits, as LAS asks for."""
-    return np.rint(shares.clip(0, 1) * _FULL_INTENSITY).astype(np.uint16)
 
 
 def las_of(columns: Mapping[str, NDArray], suffix: str) -> bytes:

@@ -198,13 +198,10 @@ def _distance(
         distance = np.where(meets, distance, np.float32(np.nan))
     if drawn is not None:
         extinction = solids.extinction[index]
-        distance = np.where(extinction > 0, _inside_medium(distance, drawn, extinction), distance)
+        # A ray that starts within a medium does not see it.
+        inside = np.where(distance > 0, distance + drawn / extinction, np.float32(np.nan))
+        distance = np.where(extinction > 0, inside, distance)
     return np.where(distance <= leave, distance, np.float32(np.nan))
-
-
-def _inside_medium(distance: Floats, drawn: Floats, extinction: Floats) -> Floats:
-    """Distance of the hit inside a medium that the ray enters at ``distance``; NaN from within."""
-    return np.where(distance > 0, distance + drawn / extinction, np.float32(np.nan))
 
 
 def _meets_slat(
