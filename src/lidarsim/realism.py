@@ -15,7 +15,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
-from itertools import combinations, product
+from itertools import chain, combinations, product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -62,20 +62,13 @@ class Measure(NamedTuple):
 def measures(s: ScanStatistics) -> dict[str, Measure]:
     """The 36 measures of a set of scans by name."""
     missing = {need: why for need, (count, why) in _NEEDS.items() if not getattr(s, count)}
+    groups = (_returns, _losses, _beams, _intensities, _ground, _neighbours_and_places)
     by_name = {}
-    for measure in _measures(s):  # whose ``lacks`` are still names of ``_NEEDS``
+    # Their ``lacks`` are still names of ``_NEEDS``.
+    for measure in chain.from_iterable(group(s) for group in groups):
         lacks = next((missing[need] for need in measure.lacks.split() if need in missing), "")
         by_name[measure.name] = measure._replace(lacks=lacks)
     return by_name
-
-
-def _measures(s: ScanStatistics) -> Iterator[Measure]:
-    yield from _returns(s)
-    yield from _losses(s)
-    yield from _beams(s)
-    yield from _intensities(s)
-    yield from _ground(s)
-    yield from _neighbours_and_places(s)
 
 
 def _returns(s: ScanStatistics) -> Iterator[Measure]:
