@@ -14,6 +14,7 @@ from r3dpa.geometry import (
     in_range,
     points_of,
     pool_cells,
+    project_pixels,
     range_image,
     unproject,
 )
@@ -143,6 +144,10 @@ def test_points_and_images_of_wrong_shapes_are_refused():
     for function, arguments, message in (
         (projection.pixel_of, (torch.zeros(7, 4),), r"\(7, 4\)"),
         (range_image, (torch.zeros(2, 2, 5, 3), projection), r"\(2, 2, 5, 3\)"),
+        (range_image, (points, projection, torch.ones(4, 1)), r"values must be \(5, F\).*\(4, 1\)"),
+        (range_image, (points, projection, torch.ones(6, 1)), r"values must be \(5, F\).*\(6, 1\)"),
+        (range_image, (points, projection, torch.ones(5)), r"values must be \(5, F\).*\(5,\)"),
+        (project_pixels, (points, projection, torch.ones(4)), r"labels must be \(5,\).*\(4,\)"),
         (points_of, (torch.zeros(1, 8, 16), projection), "one by one"),
         (pool_cells, (points, torch.zeros(5, 1), projection, (3, 4)), "3 x 4"),
         (pool_cells, (points, torch.zeros(4, 1), projection, (2, 4)), r"\(4, 1\)"),

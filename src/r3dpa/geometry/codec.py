@@ -54,7 +54,14 @@ def project_pixels(points: Tensor, projection: Projection, labels: Tensor | None
         points: ``(P, 3)`` x, y, z in metres, or ``(P, 4)`` with the intensity.
         projection: Which pixel a point belongs to.
         labels: ``(P,)`` integers, KITTI-360 class in the lower 16 bits.
+
+    Raises:
+        ValueError: If the number of labels is not the number of points.
     """
+    if labels is not None and labels.shape != points.shape[:1]:
+        raise ValueError(
+            f"labels must be ({len(points)},), one per point, got shape {tuple(labels.shape)}"
+        )
     values = points[:, 3:4]
     with_intensity = values.shape[1] == 1
     if labels is not None:

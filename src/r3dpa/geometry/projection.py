@@ -142,10 +142,20 @@ def range_image(
         ``range_m`` ``(H, W)`` or ``(B, H, W)`` float32, ``EMPTY_RANGE_M`` without a return, and
         the values of the nearest returns ``(F, H, W)`` or ``(B, F, H, W)``, 0 without a return,
         or None.
+
+    Raises:
+        ValueError: If points or values have another shape.
     """
     check_points(points)
     if points.ndim not in (2, 3):
         raise ValueError(f"points must be (P, 3) or (B, P, 3), got shape {tuple(points.shape)}")
+    if values is not None and (
+        values.ndim != points.ndim or values.shape[:-1] != points.shape[:-1]
+    ):
+        raise ValueError(
+            f"values must be ({', '.join(map(str, points.shape[:-1]))}, F), a row per point, got "
+            f"shape {tuple(values.shape)}"
+        )
     beams, columns = projection.sensor.beams, projection.sensor.columns
     leading = points.shape[:-2]
     distance = range_of(points)
