@@ -54,6 +54,28 @@ def test_a_slice_has_every_part(labelled, edited):
     assert edited[1:].intensity is None
 
 
+@pytest.mark.parametrize(
+    "some", [[2, 0], np.array([2, 0]), torch.tensor([2, 0]), np.array([True, False, True])]
+)
+def test_some_of_the_scenes_are_a_batch(labelled, some):
+    chosen = labelled[some]
+    assert type(chosen) is SceneBatch
+    assert chosen.range_m.equal(labelled.range_m[torch.as_tensor(some)])
+    assert len(chosen.latents) == len(chosen.labels) == 2
+
+
+@pytest.mark.parametrize("number", [np.int64(1), torch.tensor(1)])
+def test_the_number_of_a_scene_may_be_of_numpy_or_torch(labelled, number):
+    assert isinstance(labelled[number], Scene)
+    assert labelled[number].range_m.equal(labelled.range_m[1])
+
+
+@pytest.mark.parametrize("wrong", [None, 1.0, "1", (0, 1)])
+def test_what_is_no_number_of_a_scene_selects_none(labelled, wrong):
+    with pytest.raises(TypeError):
+        labelled[wrong]
+
+
 def test_reprs_are_one_line(labelled, edited):
     assert repr(labelled) == (
         "SceneBatch(3 scenes, 16 x 64 pixels of range, intensity, labels, 8 evaluations each)"

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import html
 import io
+import operator
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -151,8 +152,8 @@ class Scene:
 class SceneBatch:
     """Generated scenes, on the device of the networks.
 
-    ``batch[i]`` and iteration give a :class:`Scene`, ``batch[1:3]`` and ``batch[order]``, a tensor
-    of numbers, a batch of some.
+    ``batch[i]`` and iteration give a :class:`Scene`, ``batch[1:3]`` and ``batch[order]``, a list,
+    array or tensor of numbers or a mask, a batch of some.
 
     Attributes:
         range_m: ``(B, H, W)`` float32 metres; -1 without a return, NaN for a whole scene if the
@@ -205,20 +206,23 @@ class SceneBatch:
     def __getitem__(self, index: int) -> Scene: ...
 
     @overload
-    def __getitem__(self, index: slice | Tensor) -> Self: ...
+    def __getitem__(self, index: slice | list[int] | np.ndarray | Tensor) -> Self: ...
 
-    def __getitem__(self, index: int | slice | Tensor) -> Scene | Self:
+    def __getitem__(self, index: int | slice | list[int] | np.ndarray | Tensor) -> Scene | Self:
         """One scene, or a batch of some."""
-        if isinstance(index, slice | Tensor):
+        if isinstance(index, list | np.ndarray):
+            index = torch.as_tensor(index)
+        if isinstance(index, slice) or (isinstance(index, Tensor) and index.ndim > 0):
             values = {field.name: getattr(self, field.name) for field in fields(self)}
             parts: dict[str, Any] = {
                 name: value[index] for name, value in values.items() if isinstance(value, Tensor)
             }
             return replace(self, **parts)
+        number = operator.index(index)
         intensity, labels = (
-            None if values is None else values[index] for values in (self.intensity, self.labels)
+            None if values is None else values[number] for values in (self.intensity, self.labels)
         )
-        return Scene(self.range_m[index], self.projection, intensity, labels)
+        return Scene(self.range_m[number], self.projection, intensity, labels)
 
     def __iter__(self) -> Iterator[Scene]:
         return (self[index] for index in range(len(self)))
