@@ -106,6 +106,14 @@ def test_saved_scenes_are_those_of_a_sample(labelled, tmp_path):
     assert len(np.load(folder / "range_m.npy")) == 1
 
 
+def test_unknown_formats_are_refused_before_anything_is_written(labelled, tmp_path):
+    with pytest.raises(ValueError, match="unknown format 'pcd'; choose from bin, ply, npz"):
+        labelled.save(tmp_path / "made", formats=("bin", "pcd"))
+    assert not (tmp_path / "made").exists()
+    labelled.save(tmp_path / "made", formats="ply")
+    assert len(list((tmp_path / "made" / "ply").iterdir())) == 3
+
+
 def test_a_notebook_shows_pictures_and_a_page(labelled, edited):
     assert labelled._repr_png_().startswith(b"\x89PNG")
     for batch in (labelled, edited):

@@ -240,17 +240,21 @@ class SceneBatch:
         return self[index].point_labels
 
     def save(
-        self, folder: str | Path, formats: Sequence[str] = ("bin",), overwrite: bool = False
+        self,
+        folder: str | Path,
+        formats: str | Sequence[str] = ("bin",),
+        overwrite: bool = False,
     ) -> Path:
         """Write the scenes to a folder as ``r3dpa sample`` does; return the folder.
 
         Args:
             folder: New folder, or one with earlier scenes and ``overwrite``.
-            formats: Files of points: ``bin``, ``ply``, ``npz``.
+            formats: Files of points: ``bin``, ``ply``, ``npz``, one or several.
             overwrite: Replace earlier scenes.
 
         Raises:
-            ValueError: If the folder is a file, or holds scenes and ``overwrite`` is False.
+            ValueError: If a format is unknown, or the folder is a file, or holds scenes and
+                ``overwrite`` is False.
         """
         from r3dpa.data.scene_writer import SceneWriter
 
@@ -261,6 +265,7 @@ class SceneBatch:
             raise ValueError(
                 f"{folder} holds scenes already; give another folder or overwrite=True"
             )
+        formats = (formats,) if isinstance(formats, str) else tuple(formats)
         about = {"num": len(self), "nfe": self.nfe, "formats": list(formats)}
         with SceneWriter(folder, len(self), self.projection, formats, about, overwrite) as writer:
             writer.put(self.range_m, self.nfe, self.intensity, self.labels)

@@ -32,6 +32,7 @@ from r3dpa.io import (
 )
 
 _CLOUD_WRITERS: dict[str, Callable[[Path, Tensor], None]] = {"bin": write_bin, "ply": write_ply}
+_FORMATS = (*_CLOUD_WRITERS, "npz")
 #: Files that ``r3dpa sample`` and the edits write beside their metadata.
 _WRITTEN = (
     *_CLOUD_WRITERS,
@@ -74,8 +75,8 @@ class SceneWriter:
         overwrite: Start anew in a folder that holds scenes, finished or not.
 
     Raises:
-        ValueError: If another process writes to ``out``, or ``out`` holds scenes of another
-            request, or as many as ``num``.
+        ValueError: If a format is unknown, another process writes to ``out``, or ``out`` holds
+            scenes of another request, or as many as ``num``.
 
     Attributes:
         num_done: Scenes written so far, also by interrupted runs of the same request.
@@ -91,6 +92,9 @@ class SceneWriter:
         request: dict[str, Any],
         overwrite: bool = False,
     ) -> None:
+        for name in formats:
+            if name not in _FORMATS:
+                raise ValueError(f"unknown format {name!r}; choose from {', '.join(_FORMATS)}")
         self.out, self.num, self.num_done, self.evaluations = out, num, 0, 0
         self._projection = projection
         self._formats = tuple(formats)
