@@ -104,14 +104,30 @@ def test_a_request_for_no_scene_is_refused(none):
         generator().generate(none)
 
 
-@pytest.mark.parametrize("wrong", [True, "3", 1.5])
+@pytest.mark.parametrize("wrong", [True, "3", 1.5, None, {0, 1}, torch.tensor(1.5)])
 def test_numbers_of_scenes_that_are_none_are_refused(wrong):
     with pytest.raises(ValueError, match="give a number of scenes or their indices, got"):
         generator().generate(wrong)
 
 
-def test_a_number_of_scenes_may_be_one_of_numpy():
-    assert len(generator(SamplerConfig("euler", steps=1)).generate(np.int64(2))) == 2
+@pytest.mark.parametrize("wrong", [[0, -1], [0.5], ["a"], torch.tensor([-3])])
+def test_indices_of_scenes_that_cannot_be_are_named(wrong):
+    with pytest.raises(ValueError, match=r"indices of scenes must be .*, got (-|0\.5|'a')"):
+        generator().generate(wrong)
+
+
+@pytest.mark.parametrize("wrong", [-1, 0.5, None, "0"])
+def test_seeds_that_cannot_be_are_named(wrong):
+    with pytest.raises(ValueError, match=rf"seed must be a whole number, .* got {wrong!r}"):
+        generator().generate(1, wrong)
+
+
+def test_a_number_of_scenes_may_be_of_numpy_or_torch():
+    scenes = generator(SamplerConfig("euler", steps=1))
+    assert len(scenes.generate(np.int64(2))) == len(scenes.generate(torch.tensor(2))) == 2
+    second = scenes.generate([1]).latents
+    for indices in (np.array([1]), torch.tensor([1])):
+        assert scenes.generate(indices).latents.equal(second)
 
 
 def test_every_quality_is_a_sampler_and_better_ones_take_longer():

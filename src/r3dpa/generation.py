@@ -448,11 +448,21 @@ def scene_indices(indices: int | Sequence[int]) -> Sequence[int]:
     """Numbers of scenes; a single number n stands for 0 to n - 1.
 
     Raises:
-        ValueError: If there is none.
+        ValueError: If there is none, or one is no whole number of 0 or greater.
     """
-    if isinstance(indices, bool | str | float):
+    if isinstance(indices, Tensor | np.ndarray):
+        indices = indices.tolist()
+    if isinstance(indices, int | np.integer) and not isinstance(indices, bool):
+        numbers: Sequence[int] = range(int(indices))
+    elif isinstance(indices, Sequence) and not isinstance(indices, str):
+        numbers = indices
+    else:
         raise ValueError(f"give a number of scenes or their indices, got {indices!r}")
-    numbers = range(int(indices)) if isinstance(indices, int | np.integer) else indices
     if len(numbers) == 0:
         raise ValueError("no scene is requested: give a number of at least 1, or indices")
+    for number in numbers:
+        if not isinstance(number, int | np.integer) or number < 0:
+            raise ValueError(
+                f"indices of scenes must be whole numbers, 0 or greater, got {number!r}"
+            )
     return numbers

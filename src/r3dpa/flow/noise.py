@@ -23,7 +23,13 @@ def scene_uniform(shape: Sequence[int], indices: Sequence[int], seed: int) -> Te
 
 
 def scene_random(seed: int, index: int, *stream: int) -> torch.Generator:
-    """Random numbers of a scene, on the CPU; without a stream, the ones of its noise."""
+    """Random numbers of a scene, on the CPU; without a stream, the ones of its noise.
+
+    Raises:
+        ValueError: If the seed is no whole number of 0 or greater.
+    """
+    if not isinstance(seed, int | np.integer) or seed < 0:
+        raise ValueError(f"seed must be a whole number, 0 or greater, got {seed!r}")
     return random_generator([seed, index, *stream])
 
 
