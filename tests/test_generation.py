@@ -190,6 +190,17 @@ def test_cuda_draws_the_scenes_of_the_cpu(sampler, monkeypatch):
     torch.testing.assert_close(on_gpu.latents.cpu(), on_cpu.latents, atol=1e-4, rtol=0)
 
 
+def test_latents_of_float64_are_decoded_and_of_another_shape_refused():
+    scenes = generator()
+    latents = scenes.noise([0, 1])
+    assert scenes.decode(latents.double()).equal(scenes.decode(latents))
+    for wrong in (latents[0], torch.zeros(2, 3), latents[:, :3]):
+        with pytest.raises(ValueError, match=r"latents must have shape \(B, \*\(4, 4, 16\)\), got"):
+            scenes.decode(wrong)
+    with pytest.raises(ValueError, match="2 scenes need as many indices, got 1"):
+        scenes.decode(latents, [0])
+
+
 def test_a_diverged_network_gives_nan_and_no_empty_scene():
     scenes = generator()
     with torch.no_grad():

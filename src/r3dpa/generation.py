@@ -343,11 +343,21 @@ class SceneGenerator:
 
         Where images have a return channel, scenes with numbers ``indices`` of the collection
         ``seed`` lose single returns at random, see :meth:`r3dpa.geometry.RangeCodec.drop_returns`.
+
+        Raises:
+            ValueError: If the latents do not have the shape of the VAE's latents, or the indices
+                are not one per scene.
         """
+        if latents.ndim != 4 or latents.shape[1:] != self.latent_shape:
+            raise ValueError(
+                f"latents must have shape (B, *{self.latent_shape}), got {tuple(latents.shape)}"
+            )
+        if indices is not None and len(indices) != len(latents):
+            raise ValueError(f"{len(latents)} scenes need as many indices, got {len(indices)}")
         size = self.batch_size or len(latents)
         sensor, codec, parts = self.geometry.projection.sensor, self.geometry.codec, []
         for first in range(0, len(latents), size):
-            part = self.latent_norm.denormalise(latents[first : first + size])
+            part = self.latent_norm.denormalise(latents[first : first + size].float())
             image = self._decode(pad_batch(part, size))[: len(part)].float()
             finite = image.flatten(1).isfinite().all(dim=1)
             if indices is not None and codec.return_channel:

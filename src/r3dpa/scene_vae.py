@@ -100,7 +100,8 @@ class SceneVAE:
         projection = self.geometry.projection
         sensor = projection.sensor
         size = self.vae.latent_channels, *self.vae.latent_size((sensor.beams, sensor.columns))
-        latents = torch.as_tensor(latents, device=next(self.vae.parameters()).device)
+        weight = next(self.vae.parameters())
+        latents = torch.as_tensor(latents, dtype=weight.dtype, device=weight.device)
         if latents.ndim != 4 or latents.shape[1:] != size:
             raise ValueError(f"latents must have shape (B, *{size}), got {tuple(latents.shape)}")
         image = self.vae.decode(latents).float()
