@@ -319,6 +319,26 @@ class TestVaryAndInterpolate:
                 editor.vary(scan, [0], start=start)
 
 
+@pytest.mark.parametrize("shape", [(16, 1), (8, 64), (2, 8), (16, 128), (64,), (1, 16, 64)])
+def test_masks_of_another_shape_are_refused(editor, scan, shape):
+    mask = torch.zeros(shape, dtype=torch.bool)
+    mask[..., :1] = True
+    for edit in (editor.inpaint, editor.complete):
+        with pytest.raises(ValueError, match=r"must have the shape \(16, 64\) of the range image"):
+            edit(scan, mask, 1)
+
+
+def test_images_that_are_no_scans_are_not_encoded(editor, scan):
+    images = torch.stack([scan, scan.roll(5, dims=1)])
+    single = editor.encode(images[1])
+    torch.testing.assert_close(editor.encode(images.numpy())[1:], single)  # rounding of a batch
+    with pytest.raises(ValueError, match=r"got shape \(8, 64\)"):
+        editor.encode(images[:, :8])
+    images[1, 0, 0] = torch.nan
+    with pytest.raises(ValueError, match="NaN or infinite values"):
+        editor.encode(images)
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [

@@ -174,7 +174,7 @@ class SceneEditor:
                 need scans with one in [0, 1].
         """
         if isinstance(scan, Tensor | np.ndarray) and scan.ndim == 3:
-            return self._encode(Pixels(torch.as_tensor(scan)))
+            return self._encode(_concatenate([_batch_of(self.pixels(image)) for image in scan]))
         return self._encode(_batch_of(self.pixels(scan)))
 
     def pixels(self, scan: ScanLike) -> Pixels:
@@ -211,7 +211,7 @@ class SceneEditor:
             dilation: Rings of tokens around the mask that are generated anew as well.
         """
         times, pixels = self.settings.times(start), self.pixels(scan)
-        pixel_mask = check_mask(torch.as_tensor(pixel_mask), "mask")
+        pixel_mask = self._checked_mask(pixel_mask, "mask")
         tokens = token_mask(pixel_mask, self._sit.grid_size, dilation=dilation)
         tokens = tokens.to(self.generator.device)
         edited = mask_of_tokens(tokens, self._sit.grid_size, self._sit.input_size)[None, None]
@@ -289,7 +289,7 @@ class SceneEditor:
             seed: Seed of the results; each depends on (seed, number) alone.
             start: Time of the noise, in (0, 1]; larger values rely less on the interpolation.
         """
-        missing = check_mask(torch.as_tensor(missing), "mask of what is missing")
+        missing = self._checked_mask(missing, "mask of what is missing")
         if not 0 < start <= 1:
             raise ValueError(f"start must be a time above 0 (scan) up to 1 (noise), got {start:g}")
         pixels = self.pixels(scan)
@@ -357,6 +357,16 @@ class SceneEditor:
         scenes = torch.cat([self._solve(self._sit.velocity, noise, times) for noise in batches])
         errors = self._errors(ends.range_m, latents, trajectory)
         return self._result(self._decoded(scenes), scenes, 2 * self._nfe, *errors)
+
+    def _checked_mask(self, mask: Tensor | np.ndarray, what: str) -> Tensor:
+        """Mask of the pixels of an image; refuses one of another shape."""
+        mask, sensor = torch.as_tensor(mask), self.generator.geometry.projection.sensor
+        if mask.shape != (sensor.beams, sensor.columns):
+            raise ValueError(
+                f"{what}: must have the shape ({sensor.beams}, {sensor.columns}) of the range "
+                f"image, got {tuple(mask.shape)}"
+            )
+        return check_mask(mask, what)
 
     def _encode(self, pixels: Pixels) -> Tensor:
         """Normalised latents of pixels ``(B, H, W)``."""
