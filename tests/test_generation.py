@@ -160,6 +160,10 @@ def test_exact_velocity_leads_to_the_data():
         ({"steps": 0}, r"steps >= 1, .* got 0, 1.0 and 1.0"),
         ({"shift": 0.0}, r"shift > 0 .* got 256, 0.0 and 1.0"),
         ({"eta": -1.0}, r"eta >= 0, got 256, 1.0 and -1.0"),
+        ({"eta": float("nan")}, r"eta >= 0, got 256, 1.0 and nan"),
+        ({"solver": "heun", "shift": float("inf")}, r"finite shift > 0 .* got 256, inf and"),
+        ({"solver": "heun", "steps": 2.5}, r"whole number of steps >= 1, .* got 2.5, 1.0 and"),
+        ({"steps": None}, r"whole number of steps >= 1, .* got None, 1.0 and"),
         (
             {"solver": "heun", "eta": 0.5},
             r"solver heun does not read eta.* for euler_maruyama, ddpm;",

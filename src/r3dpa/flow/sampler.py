@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from importlib.resources import files
+from numbers import Integral
 from typing import Any, Literal, Self, get_args
 
 import torch
@@ -69,10 +71,11 @@ class SamplerConfig:
             raise ValueError(
                 f"solver must be one of {', '.join(get_args(Solver))}, got {self.solver!r}"
             )
-        if self.steps < 1 or self.shift <= 0 or self.eta < 0:
+        whole = isinstance(self.steps, Integral) and self.steps >= 1
+        if not (whole and 0 < self.shift < math.inf and 0 <= self.eta < math.inf):
             raise ValueError(
-                "a sampler needs steps >= 1, shift > 0 and eta >= 0, got "
-                f"{self.steps}, {self.shift} and {self.eta}"
+                "a sampler needs a whole number of steps >= 1, and finite shift > 0 and eta >= 0, "
+                f"got {self.steps}, {self.shift} and {self.eta}"
             )
         if self.sde_last not in get_args(SDELast):
             raise ValueError(
