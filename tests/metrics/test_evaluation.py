@@ -346,8 +346,37 @@ def test_one_metric_of_two_sets_is_that_of_an_evaluation():
     arrays = [(name, points.numpy()) for name, points in made]
     assert scene_distance("FGEO coverage", made, arrays, PROTOCOL) == 1
     with pytest.raises(
-        ValueError, match="unknown metric 'FGEO best'; choose from FGEO, FGEO precision"
+        ValueError,
+        match="unknown metric 'FGEO best'; choose from FGEO, FGEO inf, FGEO KID, FGEO precision",
     ):
         scene_distance("FGEO best", made, made, PROTOCOL)
     with pytest.raises(ValueError, match="FGEO KID: needs 4 scenes"):
         scene_distance("FGEO KID", made[:2], made, PROTOCOL)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("fgeo", "unknown metric 'fgeo'; choose from FGEO, FGEO inf, FGEO KID, FGEO precision,"),
+        ("jsd", "unknown metric 'jsd'; choose from JSD, TV, .*, or a feature space: .*, FWID,"),
+        ("", "unknown metric ''; choose from JSD, TV"),
+    ],
+)
+def test_unknown_metrics_are_refused_before_scenes_are_read(name, message):
+    with pytest.raises(ValueError, match=message):
+        scene_distance(name, ["not read"], ["not read"])
+
+
+@pytest.mark.parametrize("wrong", ["scans", [torch.ones(9, 3)], [("a name",)]])
+def test_scenes_of_another_form_are_refused(wrong):
+    message = r"scenes must be tuples \(name, points\), .* got (str|Tensor|tuple)"
+    with pytest.raises(ValueError, match=message):
+        scene_distance("JSD", wrong, wrong)
+
+
+def test_sets_without_a_scene_are_named():
+    scene = ("a", torch.full((9, 3), 5.0))
+    with pytest.raises(ValueError, match="there are no real scenes to compare"):
+        scene_distance("JSD", [], [scene])
+    with pytest.raises(ValueError, match="there are no generated scenes to compare"):
+        scene_distance("JSD", [scene], [])

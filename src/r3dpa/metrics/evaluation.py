@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from itertools import islice
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-from r3dpa.feature_names import FREE_SPACES
+from r3dpa.feature_names import FREE_SPACES, SPACES
 from r3dpa.io import source_commit
 from r3dpa.metrics.collection import (
     batches_with_features,
@@ -20,6 +20,7 @@ from r3dpa.metrics.collection import (
     update_with,
 )
 from r3dpa.metrics.distances import RANGE_BIN_M
+from r3dpa.metrics.feature_distances import SHARES
 from r3dpa.metrics.floors import add_floor, measure_floors, verdict, warn_of_other_sensor
 from r3dpa.metrics.functional_bev import Matching
 from r3dpa.metrics.official_statistics import OfficialSplit, OfficialStatistics
@@ -200,7 +201,8 @@ def scene_distance(
         device: Device of its network.
 
     Raises:
-        ValueError: If the metric is unknown, or needs more scenes.
+        ValueError: If the metric is unknown, there are no scenes, it needs more, or they are not of
+            this form.
 
     Example:
         >>> cloud = torch.tensor([[10.0, 0.0, 0.0], [0.0, 10.0, 0.0]])
@@ -211,22 +213,45 @@ def scene_distance(
     if name in _METRIC_OF_ROW:
         spaces, metric_name = [], _METRIC_OF_ROW[name]
     else:
+        if space.lower() not in SPACES:
+            raise ValueError(
+                f"unknown metric {name!r}; choose from {', '.join(_METRIC_OF_ROW)}, or a feature "
+                f"space: {', '.join(map(str.upper, SPACES))}"
+            )
+        label = space.upper()
+        known = [label, *(f"{label} {further}" for further in ("inf", "KID", *SHARES))]
+        if name not in known:
+            raise ValueError(f"unknown metric {name!r}; choose from {', '.join(known)}")
         spaces = [scene_features(space.lower(), ckpt, protocol, device)]
         metric_name = f"{space.lower()}_{_METRIC_OF_WORD.get(word, 'shares')}"
     limits = (protocol.num_mmd_references, protocol.num_mmd_samples)
     collection = scene_metrics(protocol, {s.name: s.dim for s in spaces}, max_images=limits)
     for scenes, is_real in ((real, True), (generated, False)):
-        usable = usable_scenes((EvaluationScene(*scene) for scene in scenes), protocol)
-        for batch, features in batches_with_features(usable, spaces):
+        num_scenes = 0
+        for batch, features in batches_with_features(
+            usable_scenes(_named_scenes(scenes), protocol), spaces
+        ):
             update_with(collection, batch, features, is_real)
+            num_scenes += len(batch)
+        if not num_scenes:
+            raise ValueError(f"there are no {'real' if is_real else 'generated'} scenes to compare")
     metric = metrics_by_name(collection)[metric_name]
     rows = {row.name: row for row in metric.results(Resampling(num_resamples=0))}
-    if name not in rows:
-        raise ValueError(f"unknown metric {name!r}; choose from {space}, {', '.join(rows)}")
     value = rows[name].value
     if value is None:
         raise ValueError(f"{name}: {rows[name].note}")
     return value
+
+
+def _named_scenes(scenes: Iterable[Any]) -> Iterator[EvaluationScene]:
+    """Scenes of tuples; refuses files and bare clouds, which an iteration would take apart."""
+    for scene in scenes:
+        if not isinstance(scene, tuple) or len(scene) < 2:
+            raise ValueError(
+                "scenes must be tuples (name, points), such as r3dpa.data.read_samples gives, got "
+                f"{type(scene).__name__}"
+            )
+        yield EvaluationScene(*scene)
 
 
 def check_counts(

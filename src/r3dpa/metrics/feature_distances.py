@@ -34,6 +34,8 @@ _NOTES_OF_SHARES = {
     # Real scans share their neighbours, so that missed ones come in groups.
     "coverage": f"{OVER_REAL_SCANS}; up to a fifth too narrow",
 }
+SHARES = tuple(_NOTES_OF_SHARES)
+"""Last words of the rows of :class:`PrecisionRecall`."""
 
 
 class FeatureMetric(SceneMetric):
