@@ -230,3 +230,18 @@ def test_guidance_among_the_arguments_of_a_sit_is_read_as_a_sampling_setting(tmp
     assert plain == {"class_path": "r3dpa.nn.sit.SiT", "init_args": SIT_ARGS}
     shipped = read_checkpoint("r3dpa-s")
     assert shipped.sampling == {"perturbed_attention": {"block": 6, "scale": 1.5}}
+
+
+@pytest.mark.parametrize("given", [{"encoding": "linear"}, {"sit_args": {"depth": 2}}])
+def test_options_of_official_files_are_refused_for_ours(
+    tmp_path, checkpoint, lightning_content, given
+):
+    """They would change nothing: the file records its encoding and its networks."""
+    ours, lightning = tmp_path / "ours.safetensors", tmp_path / "last.ckpt"
+    save_checkpoint(checkpoint, ours)
+    torch.save(lightning_content, lightning)
+    for path in (ours, lightning):
+        read_checkpoint(path)
+        message = rf"cannot read .*{path.name}: only official files need {next(iter(given))}, and"
+        with pytest.raises(ValueError, match=message):
+            read_checkpoint(path, **given)

@@ -83,12 +83,16 @@ def read_checkpoint(
         encoding: Official files only: range encoding, if the options do not name it.
 
     Raises:
-        ValueError: If the file is damaged, of no known layout, or names a class not allowed.
+        ValueError: If the file is damaged, of no known layout, names a class not allowed, or is not
+            official and ``sit_args`` or ``encoding`` are given.
         FileNotFoundError: If there is no such file.
     """
     path = weights_file(path)
+    given = {"sit_args": sit_args, "encoding": encoding}
+    for_official = [name for name, value in given.items() if value is not None]
     if path.suffix == ".safetensors":
         with _naming(path):
+            _refuse_options(for_official)
             described = path.with_suffix(".yaml").is_file()
             return _from_ours(path) if described else _from_diffusers(path)
     content = _load_pickle(path)
@@ -104,6 +108,7 @@ def read_checkpoint(
             if baseline is not None:
                 return baseline
         if from_lightning:
+            _refuse_options(for_official)
             return _from_lightning(content, path)
         entries = list(content)[:10] if isinstance(content, Mapping) else type(content).__name__
         raise ValueError(
@@ -194,6 +199,12 @@ def convert(
     lines = [f"{source} -> {', '.join(map(str, outputs))}", table]
     lines += [f"not converted: {name} ({reason})" for name, reason in left_out.items()]
     return "\n".join(lines)
+
+
+def _refuse_options(names: Sequence[str]) -> None:
+    """Refuse options of official files for another one, where they would change nothing."""
+    if names:
+        raise ValueError(f"only official files need {' and '.join(names)}, and this is none")
 
 
 def _save_official(checkpoint: Checkpoint, out: Path, overwrite: bool) -> list[Path]:
