@@ -194,3 +194,11 @@ class TestInterruptedRun:
         rounds = [line["rounds"] for line in found["rows"]]
         assert all(len(each) == 3 for each in rounds)
         assert rounds[0][0] == first[0]
+
+
+def test_options_of_a_model_are_refused_without_one(tmp_path):
+    """Without it they would be ignored: the mixture has its own numbers."""
+    words = ["bench", "sampling", "--out", str(tmp_path / "out"), "--scenes", "4", "--nfe", "[4]"]
+    with pytest.raises(ValueError, match="--scenes, --nfe: for a model, give --ckpt"):
+        main(words)
+    assert not (tmp_path / "out").exists()

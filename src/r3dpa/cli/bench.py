@@ -61,7 +61,8 @@ def sampling(
 ) -> Any:
     """Measure accuracy against time for an exact velocity and a trained model; draw both.
 
-    The same command completes an interrupted run.
+    The same command completes an interrupted run. Numbers of scenes, rounds, evaluations and steps
+    are for the model, and refused without ``--ckpt``.
 
     Args:
         out: Folder for table, picture and figures.
@@ -76,9 +77,19 @@ def sampling(
             200 with ``--quick``.
         device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
     """
+    check_folder(out)
+    options = {
+        "scenes": scenes,
+        "batch_size": batch_size,
+        "rounds": rounds,
+        "nfe": nfe,
+        "reference_steps": reference_steps,
+    }
+    given = [f"--{name}" for name, value in options.items() if value is not None]
+    if given and ckpt is None:
+        raise ValueError(f"{', '.join(given)}: for a model, give --ckpt, such as r3dpa-s")
     from r3dpa.bench.sampling import sampling as measure
 
-    check_folder(out)
     effort = {
         "samples": scenes,
         "reference_steps": reference_steps,
