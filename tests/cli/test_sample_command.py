@@ -287,3 +287,9 @@ def test_report_draws_curves_and_lists_the_means_of_their_ends(tmp_path, capsys)
     assert "val/loss" not in printed
     (row,) = [x for x in printed.splitlines() if x.startswith("train/loss")]
     assert row.split()[1:] == ["19.5", "1.5", "-18"]
+
+
+def test_one_scene_is_counted_in_the_singular(tmp_path, capsys):
+    checkpoint = tiny_checkpoint(tmp_path / "tiny.safetensors")
+    sample(checkpoint, tmp_path / "made", "--num", 1)
+    assert f"1 scene in {tmp_path / 'made'}: 3 network" in capsys.readouterr().out

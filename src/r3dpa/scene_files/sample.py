@@ -135,7 +135,8 @@ def sample(
     note = f"sampler: {generator.sampler.summary}"
     if not given and generator.sampler == SamplerConfig.of_quality(quality or "good"):
         note = SamplerConfig.quality_line(quality or "good")  # measured, unlike a baseline's
-    line = f"{num} scenes in {files.out}: {measured['nfe']:.5g} network evaluations each"
+    number = "1 scene" if num == 1 else f"{num} scenes"
+    line = f"{number} in {files.out}: {measured['nfe']:.5g} network evaluations each"
     if measured["drawn_by_last_run"]:
         line += f", {measured['seconds_per_scene']:.3g} s per scene"
     if seen_by is not None:
