@@ -271,6 +271,14 @@ def test_refused_features_leave_the_state():
     assert metric.count("generated") == len(metric.subset("generated")[0]) == 0
 
 
+@pytest.mark.parametrize("name", ["frechet", "mmd"])
+def test_names_that_are_not_one_per_scene_leave_the_state(name):
+    metric, scenes = metric_of(name), data(name, True)
+    with pytest.raises(ValueError, match=f"{len(scenes)} scenes need as many names, got 2"):
+        metric.update(scenes, real=True, names=["a", "b"])
+    assert updated(metric, name).compute() == pytest.approx(expected(name))
+
+
 @pytest.mark.parametrize(("num_real", "message"), [(20, "generated: 6 samples"), (3, "real: 3 ")])
 @pytest.mark.numerics("Frechet distance of few samples")
 def test_too_few_samples_for_the_features_are_refused_or_noted(num_real, message):

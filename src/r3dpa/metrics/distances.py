@@ -165,6 +165,7 @@ class SceneMetric(Metric):
 
     def _append(self, side: str, values: Tensor, names: Sequence[str] | None) -> None:
         """Add ``(B, ...)`` values to the count and to the states of single scenes."""
+        check_names(names, len(values))
         hashes = [0] * len(values) if names is None else [_hash_of(name) for name in names]
         count = getattr(self, f"{side}_count")
         places = count + torch.arange(len(values), device=self.device)
@@ -199,6 +200,12 @@ class SceneMetric(Metric):
         return MetricResult(
             name, value, scale=scale, num_samples=generated, num_references=real, **fields
         )
+
+
+def check_names(names: Sequence[str] | None, num_scenes: int) -> None:
+    """Refuse names that are not one per scene with a ValueError."""
+    if names is not None and len(names) != num_scenes:
+        raise ValueError(f"{num_scenes} scenes need as many names, got {len(names)}")
 
 
 class _Histograms(SceneMetric):

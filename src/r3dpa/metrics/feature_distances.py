@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from r3dpa.metrics.distances import OVER_REAL_SCANS, SIDES, SceneMetric
+from r3dpa.metrics.distances import OVER_REAL_SCANS, SIDES, SceneMetric, check_names
 from r3dpa.metrics.functional import (
     Moments,
     fd_infinity,
@@ -68,12 +68,14 @@ class FeatureMetric(SceneMetric):
         """Add ``(N, F)`` features, or such by space.
 
         Raises:
-            ValueError: If features are not finite or of another width; none is added then.
+            ValueError: If features are not finite or of another width, or names are not one per
+                scene; none is added then.
         """
         side = "real" if real else "generated"
         if not isinstance(features, Tensor):
             features = features[self.label.lower()]
         features = features.detach()
+        check_names(names, len(features))
         added = Moments.of(features, f"{side} features")
         setattr(self, f"{side}_moments", self.moments(side).merge(added).pack())
         self._append(side, features, names)
