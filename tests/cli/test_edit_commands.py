@@ -303,7 +303,7 @@ REFUSED = [
     ("vary", "--scan tilted.bin", r"tilted.bin: .*outside the field"),
     ("vary", "--scan two.npz", "must hold one scan.*its arrays are x, y"),
     ("vary", "--scan gone.bin", "gone.bin"),
-    ("interpolate", "--left a.bin --right b.bin --frames 1", "at least 2"),
+    ("interpolate", "--left a.bin --right b.bin --num 1", "--num must be at least 2"),
 ]
 
 

@@ -271,7 +271,7 @@ def interpolate(*, left: Path, right: Path, frames: int = 8, **options: Any) -> 
     """
     arguments = {"left": left, "right": right, "frames": frames}
     if frames < 2:
-        raise ValueError(f"frames must be at least 2, the two scans; got {frames}")
+        raise ValueError(f"--num must be at least 2, the two scans; got {frames}")
     from r3dpa.scene_files.edits import EditSession
 
     session = EditSession(EditOptions(**options), frames)
