@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from r3dpa.editing.regions import (
     angle_box,
     box3d,
+    box3d_front_m,
     check_mask,
     dilated,
     dropped_beams,
@@ -118,6 +119,15 @@ def test_box_ahead_takes_the_pixels_it_fills():
     assert left.equal(box3d(COARSE, (0, 10.5, 0), (1, 5.3, 3.6), yaw_deg=90))
     # Behind, across the seam.
     assert selected(box3d(COARSE, (-10.5, 0, 0), (1, 5.3, 3.6)), 1) == [0, 35]
+
+
+def test_the_near_side_of_a_box_is_where_rays_enter_it():
+    """A wall at 10 m ahead: 10 m / (cos 5 cos 5) along the rays at 5 degrees; 0 beside it."""
+    front_m = box3d_front_m(COARSE, (10.5, 0, 0), (1, 5.3, 3.6))
+    mask = box3d(COARSE, (10.5, 0, 0), (1, 5.3, 3.6))
+    assert front_m.gt(0).equal(mask)
+    expected = 10 / math.cos(math.radians(5)) ** 2
+    torch.testing.assert_close(front_m[mask], torch.full((4,), expected), atol=1e-5, rtol=0)
 
 
 def test_points_in_a_turned_box():

@@ -9,10 +9,18 @@ import pytest
 import torch
 from tiny_networks import VAE_ARGS, tiny_checkpoint, tiny_networks
 
-from lidarsim import RecordedScan
+from lidarsim import RecordedScan, Simulator
 from r3dpa.data import write_bin
 from r3dpa.editing import EditSettings, SceneEditor
-from r3dpa.editing.regions import angle_box, dropped_beams, sector_weights, token_mask
+from r3dpa.editing.objects import ObjectLibrary
+from r3dpa.editing.regions import (
+    angle_box,
+    box3d,
+    box3d_front_m,
+    dropped_beams,
+    sector_weights,
+    token_mask,
+)
 from r3dpa.generation import SamplerConfig, SceneGenerator
 from r3dpa.geometry import (
     NUM_CLASSES,
@@ -24,6 +32,7 @@ from r3dpa.geometry import (
     range_image,
 )
 from r3dpa.nn import VAE
+from r3dpa.pretrained import objects_file
 from r3dpa.scene_vae import SceneVAE
 from r3dpa.scenes import Scene
 
@@ -106,10 +115,46 @@ class TestInpaint:
         assert result.nfe == 10
         assert len(calls) == 10 + 5  # and the way back without an edit, which is measured
 
+    def test_a_box_changes_nothing_unless_something_is_drawn_in_front_of_it(self, editor, scan):
+        """Returns lie beyond 1 m, so that a near side at 1 m moves nothing."""
+        ways = {}
+        for metres in (None, 1.0, 20.0):
+            front_m = None if metres is None else torch.where(MASK, metres, 0.0)
+            ways[metres] = editor.inpaint(scan, MASK, range(2), feature=FEATURE, front_m=front_m)
+        assert ways[1.0].latents.equal(ways[None].latents)
+        assert not ways[20.0].latents.equal(ways[None].latents)
+        assert ways[20.0].range_m[:, ~MASK].equal(scan[~MASK].expand(2, -1))
+        with pytest.raises(ValueError, match=r"near side: must have the shape \(16, 64\)"):
+            editor.inpaint(scan, MASK, [0], front_m=torch.ones(8, 64))
+
+    def test_corrected_steps_count_as_evaluations(self, generator, scan):
+        """Steps to .8, .6, .4 and .2 of five; the last one ends at 0."""
+        editor = SceneEditor(generator, EditSettings("euler", 5))
+        front_m = torch.where(MASK, 20.0, 0.0)
+        assert editor.inpaint(scan, MASK, [0], front_m=front_m).nfe == 2 * 5 + 4
+
     def test_masks_that_leave_nothing_are_refused(self, editor, scan):
         for mask in (torch.zeros(16, 64, dtype=torch.bool), torch.ones(16, 64, dtype=torch.bool)):
             with pytest.raises(ValueError, match=r"selects (nothing|all)"):
                 editor.inpaint(scan, mask, [0])
+
+
+@pytest.mark.slow
+def test_the_cars_of_r3dpa_s_stand_in_their_box():
+    """Two draws to the left of a simulated scan; by features alone, most of a car stands nearer."""
+    editor = SceneEditor.from_checkpoint("r3dpa-s", EditSettings(steps=8), device="cpu")
+    projection = editor.generator.geometry.projection
+    scan = editor.pixels(Simulator().scan(0).points)
+    place = ((0.0, 9.0, -0.95), (4.2, 1.8, 1.5))
+    mask, front_m = box3d(projection, *place), box3d_front_m(projection, *place)
+    car = ObjectLibrary.load(objects_file("r3dpa-s")).feature("car")
+
+    def share_in_front(front_m):
+        range_m = editor.inpaint(scan, mask, 2, feature=car, front_m=front_m).range_m[:, mask]
+        return ((range_m > 0) & (range_m < near_side_m - 0.5)).float().mean()
+
+    near_side_m = front_m[mask]
+    assert share_in_front(front_m) < 0.6 * share_in_front(None)
 
 
 def test_a_scene_does_not_depend_on_its_batch(generator, scan):

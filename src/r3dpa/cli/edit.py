@@ -42,7 +42,8 @@ def inpaint(
     Args:
         scan: Scan to edit: ``.bin``, ``.ply``, or ``.npz`` of one scan.
         box: Azimuth from and to (leftwards), inclination from and to: degrees, ``-10 10 -20 0``.
-        box3d: Centre x y z, length, width, height (metres, frame of the sensor), yaw (degrees).
+        box3d: Centre x y z, length, width, height (metres, frame of the sensor), yaw (degrees). An
+            object is moved into the box where it is drawn in front of it.
         mask: Picture of H x W pixels as the range image, bright where it is to change.
         objects: File of ``r3dpa data objects``, made with the feature source of the checkpoint;
             default: the one beside the weights.
@@ -84,7 +85,7 @@ def inpaint(
     from r3dpa.scene_files.edits import EditSession
     from r3dpa.scene_files.generated import feature_source_of
 
-    feature = extractor = inside = None
+    feature = extractor = inside = front_m = None
     if object is not None and objects is not None:
         library = ObjectLibrary.load(objects)
         feature = library.feature(object)  # an unknown name is refused before the weights are read
@@ -102,6 +103,8 @@ def inpaint(
         }
         region = regions.box3d(session.projection, **place)
         inside = partial(regions.in_box3d, **place)
+        if feature is not None:
+            front_m = regions.box3d_front_m(session.projection, **place)
     if feature is not None:
         library.check_source(feature_source_of(session.checkpoint), session.sit.feature_dim)
         if features_ckpt is not None or library.source in OWN_WEIGHTS:
@@ -114,6 +117,7 @@ def inpaint(
             num,
             session.options.seed,
             feature=feature,
+            front_m=front_m,
             start=start,
             dilation=dilation,
         )

@@ -91,10 +91,6 @@ def box3d(
 ) -> Tensor:
     """Pixels whose ray meets a box within the range limits, whatever occludes the box.
 
-    Slab test per ray ``t * d`` from the sensor, with the box's centre c and half size s in the
-    axes of the box: the ray is inside for ``max_i min(t_i) <= t <= min_i max(t_i)``, where
-    ``t_i = (c_i -+ s_i) / d_i``.
-
     Args:
         projection: Rays of the range image.
         centre_m: x forward, y left, z up of the middle of the box, in the sensor frame.
@@ -104,7 +100,34 @@ def box3d(
     Returns:
         ``(H, W)`` bool.
     """
+    entry_m, exit_m, what = _ray_spans(projection, centre_m, size_m, yaw_deg)
     sensor = projection.sensor
+    met = (entry_m <= exit_m) & (entry_m < sensor.range_max_m) & (exit_m > sensor.range_min_m)
+    if not met.any():
+        raise _no_ray_error(projection, what)
+    return check_mask(met, what)
+
+
+def box3d_front_m(
+    projection: Projection, centre_m: Sequence[float], size_m: Sequence[float], yaw_deg: float = 0.0
+) -> Tensor:
+    """Range ``(H, W)`` float32 at which each ray enters a box; 0 where it misses the box.
+
+    See :func:`box3d` for the arguments.
+    """
+    entry_m, exit_m, _ = _ray_spans(projection, centre_m, size_m, yaw_deg)
+    return torch.where(entry_m <= exit_m, entry_m.clamp(min=0), 0.0).float()
+
+
+def _ray_spans(
+    projection: Projection, centre_m: Sequence[float], size_m: Sequence[float], yaw_deg: float
+) -> tuple[Tensor, Tensor, str]:
+    """Ranges ``(H, W)`` float64 at which rays enter and leave a box, and words for the box.
+
+    Slab test per ray ``t * d`` from the sensor, with the box's centre c and half size s in the
+    axes of the box: the ray is inside for ``max_i min(t_i) <= t <= min_i max(t_i)``, where
+    ``t_i = (c_i -+ s_i) / d_i``. A ray that misses the box leaves before it enters.
+    """
     what = (
         f"box at ({', '.join(f'{v:g}' for v in centre_m)}) m of size "
         f"{' x '.join(f'{v:g}' for v in size_m)} m, yaw {yaw_deg:g} degrees"
@@ -122,12 +145,9 @@ def box3d(
     # A ray in the plane of a face gives 0 / 0: it touches the slab everywhere.
     low = ((centre - half) / directions).nan_to_num(-math.inf, math.inf, -math.inf)
     high = ((centre + half) / directions).nan_to_num(math.inf, math.inf, -math.inf)
-    entry = torch.minimum(low, high).amax(dim=-1)
-    end = torch.maximum(low, high).amin(dim=-1)
-    met = (entry <= end) & (entry < sensor.range_max_m) & (end > sensor.range_min_m)
-    if not met.any():
-        raise _no_ray_error(projection, what)
-    return check_mask(met, what)
+    entry_m = torch.minimum(low, high).amax(dim=-1)
+    exit_m = torch.maximum(low, high).amin(dim=-1)
+    return entry_m, exit_m, what
 
 
 def dropped_beams(projection: Projection, kept: Sequence[int]) -> Tensor:

@@ -68,7 +68,10 @@ class ShownEdits:
 
     def _cars(self, scene: Scene, car: Tensor) -> Tensor:
         place = regions.box3d(self.projection, _CAR_CENTRE_M, _CAR_SIZE_M)
-        draws = self.editor.inpaint(scene, place, _CAR_DRAWS, self.seed, feature=car)
+        front_m = regions.box3d_front_m(self.projection, _CAR_CENTRE_M, _CAR_SIZE_M)
+        draws = self.editor.inpaint(
+            scene, place, _CAR_DRAWS, self.seed, feature=car, front_m=front_m
+        )
         if self.teacher is not None:
             inside = partial(regions.in_box3d, centre_m=_CAR_CENTRE_M, size_m=_CAR_SIZE_M)
             draws = most_like_first(draws, place, car, self.teacher, self.grid_size, inside)
