@@ -35,6 +35,8 @@ def test_points_that_are_no_scan_in_metres(vae, points):
     ):
         with pytest.raises(ValueError, match=message):
             vae.encode(wrong)
+    with pytest.warns(UserWarning, match="above or below the field of view"):
+        vae.encode(points)
 
 
 def test_latents_of_numpy_are_taken_and_of_another_shape_refused(vae, points):

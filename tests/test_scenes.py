@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from types import SimpleNamespace
 
@@ -88,6 +89,17 @@ def test_reprs_are_one_line(labelled, edited):
 def test_an_image_in_millimetres_or_without_a_return_is_no_scan(image):
     with pytest.raises(ValueError, match=r"no return within 1\.\.56 m; ranges must be metres"):
         scan_pixels(image, PROJECTION)
+
+
+def test_a_scan_that_looks_beyond_the_field_of_view_is_warned_of(recwarn):
+    """Rays 10 degrees above the highest one: a fifth of the points is no reason, a third is."""
+    points = points_of(torch.full((16, 64), 10.0), PROJECTION)
+    rise = math.radians(PROJECTION.sensor.inclination_max_deg + 10)
+    above = torch.tensor([10 * math.cos(rise), 0.0, 10 * math.sin(rise)])
+    scan_pixels(torch.cat([points, above.expand(len(points) // 4, 3)]), PROJECTION)
+    assert not recwarn.list
+    with pytest.warns(UserWarning, match="33% of the points of the scan lie above or below"):
+        scan_pixels(torch.cat([points, above.expand(len(points) // 2, 3)]), PROJECTION)
 
 
 def test_saved_scenes_are_those_of_a_sample(labelled, tmp_path):

@@ -14,7 +14,7 @@ from r3dpa.generation import geometry_of, open_checkpoint
 from r3dpa.geometry import ScanGeometry, project_pixels
 from r3dpa.io import usable_device
 from r3dpa.nn import VAE
-from r3dpa.scenes import SceneBatch
+from r3dpa.scenes import SceneBatch, warn_of_points_outside_view
 
 
 class SceneVAE:
@@ -84,6 +84,7 @@ class SceneVAE:
             ValueError: If the points are no array of points, not finite, or all out of range.
         """
         given = self._checked_points(points)
+        warn_of_points_outside_view(given[:, :3], self.geometry.projection)
         known = None if labels is None else torch.from_numpy(np.asarray(labels, dtype=np.int64))
         pixels = project_pixels(given, self.geometry.projection, known)
         codec = self.vae.codec_of_input(self.geometry.codec)

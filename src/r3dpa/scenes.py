@@ -9,6 +9,7 @@ from __future__ import annotations
 import html
 import io
 import operator
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -26,15 +27,18 @@ from r3dpa.geometry import (
     Projection,
     classes_of,
     in_range,
+    in_view,
     labels_of,
     points_of,
     project_pixels,
     values_at_returns,
     values_in,
+    view_limits_deg,
     view_of,
 )
 
 _PICTURES, _PAGES = 4, 8  # scenes that a notebook cell shows
+_MOST_OUTSIDE = 0.2  # share of the points of a scan that are outside the field of view
 
 ScanLike = Any
 """A scan: points ``(P, 3)``, or ``(P, 4)`` with the intensity; a range image ``(H, W)`` in metres;
@@ -44,7 +48,7 @@ both as tensors or NumPy arrays; the file of a scan; a :class:`Scene` or
 
 
 def scan_pixels(scan: ScanLike, projection: Projection) -> Pixels:
-    """Pixels ``(H, W)`` of a scan, on the CPU.
+    """Pixels ``(H, W)`` of a scan, on the CPU; see :func:`warn_of_points_outside_view`.
 
     Args:
         scan: See :data:`ScanLike`.
@@ -92,8 +96,23 @@ def scan_pixels(scan: ScanLike, projection: Projection) -> Pixels:
             f"the scan has no point within {sensor.range_min_m:g}..{sensor.range_max_m:g} m; "
             "coordinates must be metres"
         )
+    warn_of_points_outside_view(values[:, :3], projection)
     given = None if labels is None else torch.from_numpy(np.asarray(labels, dtype=np.int64))
     return project_pixels(values, projection, given)
+
+
+def warn_of_points_outside_view(points: Tensor, projection: Projection) -> None:
+    """Warn if more than a fifth of points ``(P, 3)`` lies above or below the field of view."""
+    seen = points[in_range(points, projection.sensor)]
+    outside = 1 - in_view(seen, projection).double().mean().item()
+    if outside > _MOST_OUTSIDE:
+        lowest, highest = view_limits_deg(projection)
+        warnings.warn(
+            f"{outside:.0%} of the points of the scan lie above or below the field of view, "
+            f"{lowest:.1f} to {highest:.1f} degrees, and end in its first or last row: the scan is "
+            "of another sensor, or not in its own frame",
+            stacklevel=4,
+        )
 
 
 def map_pixels(function: Callable[[Tensor], Tensor], pixels: Pixels) -> Pixels:

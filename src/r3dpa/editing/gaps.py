@@ -10,7 +10,14 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from r3dpa.geometry import EMPTY_RANGE_M, Pixels, Projection, in_range
+from r3dpa.geometry import (
+    EMPTY_RANGE_M,
+    Pixels,
+    Projection,
+    in_range,
+    in_view,
+    view_limits_deg,
+)
 from r3dpa.geometry.sensor import angles_of
 
 Interpolation = Literal["inverse", "linear", "nearest"]
@@ -20,16 +27,8 @@ _LEAST_ROWS, _LEAST_COLUMNS = 0.5, 0.75
 _LEAST_DENSE = 0.6
 # Share of the points beyond the field of view, of scans of the same and of another sensor.
 _MOST_OUTSIDE, _MOST_OUTSIDE_OF_ANOTHER = 0.2, 0.6
-_MARGIN_DEG = 1.5  # some lasers of a real sensor look further up or down than its nominal limits
 _WIDEST_GAP_ROWS = 8  # between two beams of a sensor that has fewer
 _ONE_SURFACE = 1.3  # ratio of ranges up to which two beams are taken to meet one surface
-
-
-def in_view(points: Tensor, projection: Projection) -> Tensor:
-    """Whether points ``(P, 3)`` lie in the vertical field of view, up to 1.5 degrees beyond it."""
-    inclination = angles_of(points)[0].rad2deg()
-    lowest, highest = _view_deg(projection)
-    return (inclination >= lowest - _MARGIN_DEG) & (inclination <= highest + _MARGIN_DEG)
 
 
 def check_view(
@@ -50,7 +49,7 @@ def check_view(
             beams, or more than a fifth of the points lie above or below the field of view.
     """
     sensor = projection.sensor
-    lowest, highest = _view_deg(projection)
+    lowest, highest = view_limits_deg(projection)
     view = f"{lowest:.1f} to {highest:.1f} degrees above the horizon"
     seen = points[in_range(points, sensor)]
     outside = 1 - in_view(seen, projection).double().mean().item()
@@ -171,12 +170,6 @@ def range_error_m(first_m: Tensor, second_m: Tensor, pixels: Tensor | None = Non
     if pixels is not None:
         both = both & pixels
     return (first_m.double() - second_m.double()).abs()[both].mean().item()
-
-
-def _view_deg(projection: Projection) -> tuple[float, float]:
-    """Inclinations of the lowest and highest rays."""
-    lowest, highest = projection.ray_angles()[0].rad2deg().aminmax()
-    return lowest.item(), highest.item()
 
 
 class _Neighbours(NamedTuple):

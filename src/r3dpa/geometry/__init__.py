@@ -16,12 +16,14 @@ from r3dpa.geometry.projection import (
     SphericalProjection,
     describe_share_kept,
     in_range,
+    in_view,
     points_of,
     pool_cells,
     range_image,
     share_kept,
     unproject,
     values_at_returns,
+    view_limits_deg,
 )
 from r3dpa.geometry.semantics import (
     NUM_CLASSES,
@@ -48,6 +50,7 @@ __all__ = [
     "classes_of",
     "describe_share_kept",
     "in_range",
+    "in_view",
     "labels_of",
     "points_of",
     "pool_cells",
@@ -59,5 +62,6 @@ __all__ = [
     "unproject",
     "values_at_returns",
     "values_in",
+    "view_limits_deg",
     "view_of",
 ]

@@ -29,6 +29,7 @@ from r3dpa.geometry.sensor import (
     range_of,
 )
 
+_MARGIN_DEG = 1.5  # some lasers of a real sensor look further up or down than its nominal limits
 _BAG = 32  # points of a cell that are added in float32; more are no faster
 
 
@@ -121,6 +122,19 @@ def in_range(points: Tensor, sensor: LidarSensor) -> Tensor:
     """Whether each point of ``(..., 3)`` is finite and strictly inside the range limits, bool."""
     check_points(points)
     return _inside_limits(range_of(points), sensor)
+
+
+def view_limits_deg(projection: Projection) -> tuple[float, float]:
+    """Inclinations of the lowest and highest rays, degrees."""
+    lowest, highest = projection.ray_angles()[0].rad2deg().aminmax()
+    return lowest.item(), highest.item()
+
+
+def in_view(points: Tensor, projection: Projection) -> Tensor:
+    """Whether points ``(P, 3)`` lie in the vertical field of view, up to 1.5 degrees beyond it."""
+    inclination = angles_of(points)[0].rad2deg()
+    lowest, highest = view_limits_deg(projection)
+    return (inclination >= lowest - _MARGIN_DEG) & (inclination <= highest + _MARGIN_DEG)
 
 
 def range_image(

@@ -20,9 +20,16 @@ from lidarsim.clouds import PointCloud, find_files, read_cloud
 from r3dpa.data.scene_writer import SceneWriter
 from r3dpa.editing import EditResult
 from r3dpa.editing.editor import COMPLETION_START
-from r3dpa.editing.gaps import in_view, interpolate_gaps, range_error_m, unseen_pixels
+from r3dpa.editing.gaps import interpolate_gaps, range_error_m, unseen_pixels
 from r3dpa.editing.regions import check_mask, dropped_beams, sector, sensor_pair
-from r3dpa.geometry import Pixels, Projection, SphericalProjection, points_of, values_at_returns
+from r3dpa.geometry import (
+    Pixels,
+    Projection,
+    SphericalProjection,
+    in_view,
+    points_of,
+    values_at_returns,
+)
 from r3dpa.io import in_processes
 from r3dpa.scene_files.edits import EditSession, ScanView
 from r3dpa.scene_files.options import EditOptions

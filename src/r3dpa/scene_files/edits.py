@@ -23,11 +23,11 @@ from r3dpa.data.images import read_mask
 from r3dpa.data.labels import find_labels
 from r3dpa.data.scene_writer import SceneWriter
 from r3dpa.editing import EditResult, EditSettings, SceneEditor
-from r3dpa.editing.gaps import check_view, in_view
+from r3dpa.editing.gaps import check_view
 from r3dpa.editing.regions import check_mask
 from r3dpa.features import feature_source
 from r3dpa.flow.sampler import SamplerConfig
-from r3dpa.geometry import Pixels, in_range, project_pixels
+from r3dpa.geometry import Pixels, in_range, in_view, project_pixels
 from r3dpa.io import atomic_path, json_values, usable_device, write_text
 from r3dpa.nn import VelocityNetwork
 from r3dpa.scene_files.generated import feature_source_of, provenance
