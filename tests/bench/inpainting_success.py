@@ -6,10 +6,11 @@
 Inpainting: in held-out scans, a box of the size of the object on free ground in sight, 8 to 16 m
 away, is made anew several times from the same noise: guided and moved into the box as by `r3dpa
 edit inpaint --box3d`, guided by features alone, and unguided. ``first`` is of the first draw,
-``most_like`` of the one that `r3dpa edit inpaint` puts first, ``mean`` of all. The box then holds
-such an object by class, if 5 of its points, and half of those above the ground, are of the class by
-the teacher; by size, if those above the ground reach 0.6 to 1.2 of the height of the object, or of
-what the sensor sees of it, and span at least 0.3 of its width and at most 1.2 of its length.
+``most_like`` of the one that `r3dpa edit inpaint` puts first, ``mean`` of all, ``any`` of the best.
+The box then holds such an object by class, if 5 of its points, and half of those above the ground,
+are of the class by the teacher; by label, the same by the classes that the decoder draws; by size,
+if those above the ground reach 0.6 to 1.2 of the height of the object, or of what the sensor sees
+of it, and span at least 0.3 of its width and at most 1.2 of its length.
 ``unchanged``: share of scans whose pixels outside the mask are the same in all draws.
 
 Mixing: scenes of two halves of scans; mean cosine of the teacher's cells of a half with its own and
@@ -38,7 +39,7 @@ from r3dpa.editing import EditSettings, SceneEditor, most_like_first
 from r3dpa.editing.objects import ObjectLibrary
 from r3dpa.editing.regions import box3d, box3d_front_m, in_box3d, sector_weights
 from r3dpa.features import WaffleIronS2
-from r3dpa.geometry import SEMANTIC_CLASSES, Pixels, unproject
+from r3dpa.geometry import SEMANTIC_CLASSES, Pixels, classes_of, unproject, values_at_returns
 
 NAMES = [semantic.name for semantic in SEMANTIC_CLASSES]
 # Class; length, width and height in metres; what the object stands on.
@@ -117,7 +118,7 @@ def inpainting(editors, scans, library, teacher, name, draws):
     of_class, size, grounds = OBJECTS[name]
     generator = next(iter(editors.values())).generator
     projection, feature = generator.geometry.projection, library.feature(name)
-    rows = {how: [] for how in editors}
+    rows, top_deg = {how: [] for how in editors}, projection.sensor.inclination_max_deg
     for number, pixels in enumerate(scans):
         place = free_box(pixels, projection, size, grounds, np.random.default_rng(number))
         if place is None:
@@ -135,14 +136,23 @@ def inpainting(editors, scans, library, teacher, name, draws):
             )
             seconds = (time.perf_counter() - start) / draws
             in_box = partial(in_box3d, centre_m=centre, size_m=size)
-            grid_size = generator.sit.grid_size
-            made = most_like_first(made, mask, feature, teacher.extractor, grid_size, in_box)
+            made = most_like_first(
+                made,
+                mask,
+                feature,
+                teacher.extractor,
+                generator.sit.grid_size,
+                in_box,
+                library.semantic_class(name),
+            )
             found = []
             for scene in made:
                 points = points_made(scene, pixels, projection)
                 matches = teacher.classes(points) == NAMES.index(of_class)
-                by = judge(points, matches, centre, size, projection.sensor.inclination_max_deg)
-                found.append((*by, all(by)))
+                by = judge(points, matches, centre, size, top_deg)
+                labels = values_at_returns(classes_of(scene.labels), scene.range_m, projection)
+                decoded, _ = judge(points, labels == NAMES.index(of_class), centre, size, top_deg)
+                found.append((*by, all(by), decoded))
             same = torch.equal(made.range_m[:, ~mask], pixels.range_m[~mask].expand(draws, -1))
             rows[how].append((found, made.draws.argmin().item(), same, seconds))
             sys.stderr.write(f"{name} {number} {how}: {found}\n")
@@ -152,12 +162,13 @@ def inpainting(editors, scans, library, teacher, name, draws):
 
 def summary(rows):
     """Shares over boxes, of what was found in each draw, and where the first draw stands."""
-    heads = ("by_class", "by_size", "both")
+    heads = ("by_class", "by_size", "both", "by_label")
     drawn = np.array([found for found, *_ in rows], dtype=float)
     kinds = {
         "first": drawn[np.arange(len(rows)), [first for _, first, *_ in rows]],
         "most_like": drawn[:, 0],
         "mean": drawn.mean(axis=1),
+        "any": drawn.max(axis=1),
     }
     shares = {
         kind: dict(zip(heads, values.mean(axis=0).tolist(), strict=True))

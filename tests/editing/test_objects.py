@@ -11,7 +11,13 @@ from r3dpa.data import Scan, ScanError, write_bin
 from r3dpa.data.labels import CLASS_NAMES, read_labels
 from r3dpa.editing import EditResult, most_like_first
 from r3dpa.editing.objects import ObjectClass, ObjectLibrary, object_library
-from r3dpa.geometry import LidarSensor, Pixels, RingProjection, SphericalProjection
+from r3dpa.geometry import (
+    SEMANTIC_CLASSES,
+    LidarSensor,
+    Pixels,
+    RingProjection,
+    SphericalProjection,
+)
 
 CAR, ROAD = 26, 7
 SENSOR = LidarSensor(beams=4, columns=8, inclination_max_deg=20, inclination_min_deg=-20)
@@ -213,6 +219,42 @@ def test_draws_that_miss_the_box_come_last():
     assert ordered.draws.tolist() == [1, 0, 2]
     assert ordered.points_inside.tolist() == [4, 0, 1]
     assert ordered.likeness.argmax() == 1
+
+
+class Recogniser(Distances):
+    """Takes points beyond 13 m for class 11."""
+
+    class_head = torch.nn.Identity()
+
+    def classes(self, points):
+        return torch.where(points[:, :3].norm(dim=1) > 13, 11, 2)
+
+
+def test_draws_in_which_the_object_is_recognised_come_before_others_that_fill_the_box():
+    """Likeness falls from draw to draw; the last one is recognised, but misses the box."""
+    projection = SphericalProjection(LidarSensor(beams=4, columns=8))
+    mask = torch.zeros(4, 8, dtype=torch.bool)
+    mask[2:, 4:6] = True
+    range_m = torch.full((4, 4, 8), 30.0)
+    for draw, metres in enumerate([12.5, 15.0, 15.5, 25.0]):
+        range_m[draw, mask] = metres
+    range_m[1, 2:, 4] = 12.5
+    range_m[2, 2, 4:6] = range_m[2, 3, 4] = 12.5
+    edits = EditResult(range_m, torch.arange(4.0), 2, projection)
+    arguments = edits, mask, torch.tensor([1.0, 1.0]), Recogniser(), (2, 4)
+    inside = lambda points: (points.norm(dim=1) > 12) & (points.norm(dim=1) < 20)  # noqa: E731
+    ordered = most_like_first(*arguments, inside, 11)
+    assert ordered.draws.tolist() == [1, 0, 2, 3]
+    assert ordered.points_inside.tolist() == [4, 4, 4, 0]
+    assert ordered.points_of_class.tolist() == [2, 0, 1, 0]
+    unasked = most_like_first(*arguments, inside)
+    assert unasked.draws.tolist() == [0, 2, 1, 3]
+    assert unasked.points_of_class is None
+
+
+def test_the_class_of_an_object_is_a_place_in_the_semantic_classes(library):
+    assert SEMANTIC_CLASSES[library.semantic_class("car")].name == "car"
+    assert SEMANTIC_CLASSES[library.semantic_class("tree")].name == "vegetation"
 
 
 def test_library_comes_back_from_its_file(tmp_path, library):

@@ -34,10 +34,11 @@ def inpaint(
     The part is one of --box, --box3d and --mask; pixels outside it keep the scan's values. The
     object is a class of the mean features beside the weights, such as car or tree, or of a file
     (--objects FILE --object car); without one the edit is unguided. Not every draw becomes the
-    object: the feature source looks at all of them, and the one that is most like it comes first.
-    With r3dpa-s, objects much smaller than a cell of its feature grid (11 degrees), such as poles
-    and pedestrians, hardly ever appear. Azimuth 0 looks forward and grows to the left; 180 is
-    behind.
+    object: the feature source looks at all of them, and the one that is most like it comes first;
+    in a box, those that it takes for the object come first, and the numbers of points that say so
+    are printed. With r3dpa-s, objects much smaller than a cell of its feature grid (11 degrees),
+    such as poles and pedestrians, hardly ever appear. Azimuth 0 looks forward and grows to the
+    left; 180 is behind.
 
     Args:
         scan: Scan to edit: ``.bin``, ``.ply``, or ``.npz`` of one scan.
@@ -85,10 +86,11 @@ def inpaint(
     from r3dpa.scene_files.edits import EditSession
     from r3dpa.scene_files.generated import feature_source_of
 
-    feature = extractor = inside = front_m = None
+    feature = semantic_class = extractor = inside = front_m = None
     if object is not None and objects is not None:
         library = ObjectLibrary.load(objects)
         feature = library.feature(object)  # an unknown name is refused before the weights are read
+        semantic_class = library.semantic_class(object)
     session = EditSession(shared, num, strength, window)
     source = session.read(scan)
     if mask is not None:
@@ -124,7 +126,7 @@ def inpaint(
         if feature is None or extractor is None:
             return edits
         grid_size = session.sit.grid_size
-        return most_like_first(edits, region, feature, extractor, grid_size, inside)
+        return most_like_first(edits, region, feature, extractor, grid_size, inside, semantic_class)
 
     scans, names = {f"scan {scan.stem}": source}, ("kept", object or "generated anew")
     return session.write("inpaint", arguments, scans, run, region, names, feature is not None)

@@ -96,6 +96,8 @@ class EditResult(SceneBatch):
         likeness: ``(B,)`` that they were ordered by, in [-1, 1]; else None.
         points_inside: ``(B,)`` int64 points in the box of an object, where one was given for that
             order; else None.
+        points_of_class: ``(B,)`` int64 of them that the feature source takes for the object; None
+            without a source that knows classes.
     """
 
     vae_error_m: float | None = None
@@ -104,6 +106,7 @@ class EditResult(SceneBatch):
     draws: Tensor | None = None
     likeness: Tensor | None = None
     points_inside: Tensor | None = None
+    points_of_class: Tensor | None = None
 
 
 class SceneEditor:

@@ -9,7 +9,7 @@ import json
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, cast
 
 import torch
 import torch.nn.functional as F
@@ -27,6 +27,7 @@ from r3dpa.geometry import (
     LidarSensor,
     Pixels,
     Projection,
+    classes_of,
     in_range,
     labels_of,
     projection_to_dict,
@@ -38,6 +39,8 @@ _CARD = "r3dpa_objects"
 _VERSION = 1
 # A draw fills the box of an object that holds this share of the most points of a draw.
 _FILLED = 1 / 3
+# It is recognised if the feature source takes this share of its points in the box for the object.
+_RECOGNISED = 1 / 2
 _OTHER_NAMES = {"pedestrian": "person", "tree": "vegetation"}
 
 
@@ -97,6 +100,12 @@ class ObjectLibrary:
         if name not in self.names:
             raise ValueError(f"unknown class {name!r}; choose from {', '.join(self.names)}")
         return self.features[self.names.index(name)]
+
+    def semantic_class(self, name: str) -> int:
+        """Place of a class of the library in :data:`r3dpa.geometry.SEMANTIC_CLASSES`."""
+        name = _OTHER_NAMES.get(name, name)
+        labels = {each: label for label, each in CLASS_NAMES.items()}
+        return int(classes_of(torch.tensor(labels[name])))
 
     def check_source(self, source: str | None, dim: int) -> None:
         """Refuse a network that was aligned with another source or width.
@@ -240,6 +249,7 @@ def most_like_first(
     extractor: Extractor,
     grid_size: tuple[int, int],
     inside: Callable[[Tensor], Tensor] | None = None,
+    semantic_class: int | None = None,
 ) -> EditResult:
     """Order the draws of an inpainted part by their likeness to an object, the greatest first.
 
@@ -247,7 +257,8 @@ def most_like_first(
     cells, which the feature source takes from the points of the draw. The ``cosine`` of the edits
     cannot replace it: it is of features that the network predicts, which guidance may raise
     without making an object. Where the object has a box, draws that put few points into it, since
-    their object stands in front of it or behind, come after all others.
+    their object stands in front of it or behind, come after all others; among the rest, draws come
+    first of which the feature source takes half of these points for the object.
 
     Args:
         edits: Draws of :meth:`SceneEditor.inpaint`.
@@ -257,28 +268,40 @@ def most_like_first(
         grid_size: Rows and columns (h, w) of the cells.
         inside: Which of points ``(P, 3)`` lie in the box of the object, ``(P,)`` bool, such as
             :func:`r3dpa.editing.regions.in_box3d`. Default: the part has no box.
+        semantic_class: Class of the object, see :meth:`ObjectLibrary.semantic_class`; ignored
+            for feature sources without classes. Default: the order ignores classes.
 
     Returns:
-        The edits in that order, with their ``draws`` and ``likeness``, and ``points_inside`` if
-        there is a box.
+        The edits in that order, with their ``draws`` and ``likeness``, and ``points_inside`` and
+        ``points_of_class`` if there is a box.
     """
     tokens, projection = token_mask(pixel_mask, grid_size), edits.projection
-    cosines, counts = [], []
+    classes_of_points = None
+    if semantic_class is not None and getattr(extractor, "class_head", None) is not None:
+        classes_of_points = cast(Any, extractor).classes
+    cosines, counts, counts_of_class = [], [], []
     for scene in edits:
         points = points_at_pixels(Pixels(scene.range_m, scene.intensity), projection)
         cells = grid_of_points(extractor, points, projection, grid_size)[tokens]
         cosines.append(F.cosine_similarity(cells, feature, dim=1).mean())
-        counts.append(0 if inside is None else int(inside(points[:, :3]).sum()))
-    likeness, points_inside = torch.stack(cosines), torch.tensor(counts)
-    measured = replace(
-        edits,
-        draws=torch.arange(len(edits)),
-        likeness=likeness,
-        points_inside=None if inside is None else points_inside,
-    )
-    fills_box = points_inside >= _FILLED * points_inside.max()
+        if inside is not None:
+            in_box = inside(points[:, :3])
+            counts.append(in_box.sum())
+            if classes_of_points is not None:
+                of_class = classes_of_points(points) == semantic_class
+                counts_of_class.append((in_box & of_class).sum())
+    likeness = order = torch.stack(cosines)
+    edits = replace(edits, draws=torch.arange(len(edits)), likeness=likeness)
     # Cosines differ by 2 at most.
-    return measured[(likeness + 2 * fills_box).argsort(descending=True, stable=True)]
+    if counts:
+        points_inside = torch.stack(counts)
+        edits = replace(edits, points_inside=points_inside)
+        order = order + 4 * (points_inside >= _FILLED * points_inside.max())
+    if counts_of_class:
+        points_of_class = torch.stack(counts_of_class)
+        edits = replace(edits, points_of_class=points_of_class)
+        order = order + 2 * (points_of_class >= _RECOGNISED * points_inside)
+    return edits[order.argsort(descending=True, stable=True)]
 
 
 def _labelled_points(

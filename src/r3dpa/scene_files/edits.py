@@ -38,6 +38,10 @@ from r3dpa.viz.scenes import draw_scene
 
 _SHOWN = 8  # results on the sheet and the page
 _BASELINE_STEPS = 32
+_COUNTS = {
+    "points_inside": "points in the box",
+    "points_of_class": "of them taken for the object",
+}
 
 
 class ScanView(NamedTuple):
@@ -206,13 +210,14 @@ class EditSession:
             self.show(command, scans, result.range_m, parts, part_names)
             measured = ("nfe", "vae_error_m", "round_trip_m")
             request |= {name: getattr(result, name) for name in measured} | {"seconds": seconds}
-            for name in ("cosine", "draws", "likeness", "points_inside"):
+            for name in ("cosine", "draws", "likeness", "points_inside", "points_of_class"):
                 values = getattr(result, name)
                 request[name] = None if values is None else values.tolist()
             writer.finish(request)
         counts = ""
-        if result.points_inside is not None:
-            counts = f"points in the box: {', '.join(map(str, request['points_inside']))}\n"
+        for name, about in _COUNTS.items():
+            if request[name] is not None:
+                counts += f"{about}: {', '.join(map(str, request[name]))}\n"
         return (
             f"{command}: {self.num} scene{'s' * (self.num != 1)} in {options.out}, {result.nfe} "
             f"network evaluations each, {seconds:.3g} s; errors are in metadata.json\n{counts}"

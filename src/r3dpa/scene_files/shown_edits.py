@@ -41,13 +41,15 @@ class ShownEdits:
         self.grid_size = generator.sit.grid_size
         self.seed = seed
         self.car: Tensor | None = None
+        self.car_class: int | None = None
         self.teacher: Extractor | None = None
         objects = checkpoint.path.with_suffix(OBJECTS_SUFFIX)
         if objects.is_file():
             feature_dim = generator.sit.feature_dim
             library = ObjectLibrary.load(objects)
             library.check_source(checkpoint.feature_source, feature_dim)
-            self.car = library.feature("car") if "car" in library.names else None
+            if "car" in library.names:
+                self.car, self.car_class = library.feature("car"), library.semantic_class("car")
             if library.source in OWN_WEIGHTS:
                 teacher = feature_source(library.source, dim=feature_dim)
                 self.teacher = cast(Extractor, teacher)
@@ -74,5 +76,7 @@ class ShownEdits:
         )
         if self.teacher is not None:
             inside = partial(regions.in_box3d, centre_m=_CAR_CENTRE_M, size_m=_CAR_SIZE_M)
-            draws = most_like_first(draws, place, car, self.teacher, self.grid_size, inside)
+            draws = most_like_first(
+                draws, place, car, self.teacher, self.grid_size, inside, self.car_class
+            )
         return draws.range_m[:_CARS_SHOWN]
