@@ -123,9 +123,8 @@ def test_floors_are_between_the_drives():
         [through_sensor(scene, PROTOCOL) for scene in scenes() if scene.name.startswith(drive)]
         for drive in ("drive0", "drive1")
     ]
-    cells = [[PROTOCOL.grid.cells(scene.points) for scene in drive] for drive in drives]
-    counts = [torch.cat(part).bincount(minlength=PROTOCOL.grid.side**2) for part in cells]
-    jsd = histogram_distance(*counts).jsd_distance
+    clouds = [[scene.points for scene in drive] for drive in drives]
+    jsd = histogram_distance(*map(PROTOCOL.grid.histogram, clouds)).jsd_distance
     assert rows["JSD"].floor == pytest.approx(jsd, rel=1e-9)
     frechet = frechet_distance_of(*map(toy, drives))
     assert rows["TOY"].floor == pytest.approx(frechet, rel=1e-6)

@@ -46,8 +46,9 @@ def test_histogram_distances_by_hand():
     """Shares (1, 0) and (1/2, 1/2): m = (3/4, 1/4), (ln 4/3 + ln 2/3 / 2 + ln 2 / 2) / 2."""
     result = histogram_distance(torch.tensor([2, 0, 0]), torch.tensor([3, 3, 0]))
     expected = (math.log(4 / 3) + math.log(2 / 3) / 2 + math.log(2) / 2) / 2
+    assert result.jsd_divergence == pytest.approx(expected, rel=1e-14)
     assert result.jsd_distance == pytest.approx(math.sqrt(expected), rel=1e-14)
-    assert result.total_variation == 0.5
+    assert (result.l1, result.total_variation) == (1, 0.5)
     same = histogram_distance(torch.tensor([1, 2]), torch.tensor([2, 4]))
     assert set(same) == {0}
 
@@ -111,14 +112,15 @@ def test_disjoint_histograms_are_ln_2_apart_and_empty_ones_are_refused(dtype):
     """Bins that are empty in both do not matter."""
     a, b = torch.tensor([[4, 2, 0, 0], [0, 0, 0, 7]]).to(dtype)
     found = histogram_distance(a, b)
+    assert found.jsd_divergence == pytest.approx(math.log(2), rel=1e-12)
     assert found.jsd_distance == pytest.approx(math.sqrt(math.log(2)), rel=1e-12)
-    assert found.total_variation == 1
+    assert (found.l1, found.total_variation) == (2, 1)
     for name, empty in (("first", (0 * a, b)), ("second", (a, 0 * b))):
         with pytest.raises(ValueError, match=f"{name} histogram is empty"):
             histogram_distance(*empty)
     with np.errstate(invalid="ignore"):
         assert math.isnan(jensenshannon((0 * a).double(), b.double()))
-    assert jensenshannon(a.double(), b.double()) - found.jsd_distance**2 > 0.1
+    assert jensenshannon(a.double(), b.double()) - found.jsd_divergence > 0.1
 
 
 @pytest.mark.numerics("Jensen-Shannon distance and empty counts")

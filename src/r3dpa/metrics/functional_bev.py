@@ -6,7 +6,7 @@ Letters: P points, R references, S samples.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -71,6 +71,11 @@ class BEVGrid:
         indices = (indices - math.ceil(-self.half_m / self.cell_m)).clamp(0, self.side - 1)
         return (indices[:, 0] * self.side + indices[:, 1]).unique()
 
+    def histogram(self, clouds: Iterable[Tensor]) -> Tensor:
+        """Count the clouds that occupy each cell: ``(side, side)`` int64."""
+        cells = [self.cells(points, f"cloud {index}") for index, points in enumerate(clouds)]
+        return torch.cat(cells).bincount(minlength=self.side**2).view(self.side, self.side)
+
 
 def _checked_points(points: Tensor, name: str) -> Tensor:
     if points.ndim != 2 or points.shape[1] < 3:
@@ -89,16 +94,16 @@ def _checked_points(points: Tensor, name: str) -> Tensor:
 
 
 class HistogramDistance(NamedTuple):
-    """Distances of two normalised histograms."""
+    """Distances of two normalised histograms, under the published names and the true ones."""
 
-    #: Root of the Jensen-Shannon divergence in nats, 0 to sqrt(ln 2) = 0.8326: the published "JSD".
-    jsd_distance: float
-    #: Half the sum of absolute differences, 0 to 1; the official code's "TV" is the whole sum.
-    total_variation: float
+    jsd_distance: float  # root of the divergence, 0 to sqrt(ln 2) = 0.8326: the published "JSD"
+    jsd_divergence: float  # Jensen-Shannon divergence in nats, 0 to ln 2 = 0.6931
+    l1: float  # sum of absolute differences, 0 to 2: the official code's "TV"
+    total_variation: float  # half of it, 0 to 1
 
 
 def histogram_distance(counts_a: Tensor, counts_b: Tensor) -> HistogramDistance:
-    """Compute both distances of two histograms of counts of one shape.
+    """Compute all distances of two histograms of counts of one shape.
 
     Raises:
         ValueError: If one is empty.
@@ -109,8 +114,8 @@ def histogram_distance(counts_a: Tensor, counts_b: Tensor) -> HistogramDistance:
     occupied = (counts_a > 0) | (counts_b > 0)
     a, b = (counts[occupied].double().cpu().numpy() for counts in (counts_a, counts_b))
     divergence = max(jensen_shannon(a, b), 0.0)
-    total_variation = float(np.abs(a / a.sum() - b / b.sum()).sum()) / 2
-    return HistogramDistance(math.sqrt(divergence), total_variation)
+    l1 = float(np.abs(a / a.sum() - b / b.sum()).sum())
+    return HistogramDistance(math.sqrt(divergence), divergence, l1, l1 / 2)
 
 
 def point_histogram(
@@ -139,13 +144,14 @@ def gaussian_kernel(a: Tensor, b: Tensor, sigma: float = 0.5) -> Tensor:
     return torch.exp(-torch.cdist(a, b, compute_mode=exact).square() / (2 * sigma**2))
 
 
-def kernel_mmd(within_a: Tensor, within_b: Tensor, across: Tensor) -> float:
-    """Squared maximum mean discrepancy of two sets, from the kernels of their pairs.
+def kernel_mmd(a: Tensor, b: Tensor, sigma: float = 0.5) -> float:
+    """Squared maximum mean discrepancy of normalised histograms ``(N, F)`` and ``(M, F)``.
 
     With pairs of a histogram with itself, so that it is biased upwards by about 1 / N. R2DM and
     R2Flow call it MMD; LiDM and R3DPA use that name for :func:`minimum_matching`.
     """
-    return (within_a.mean() + within_b.mean() - 2 * across.mean()).item()
+    within = gaussian_kernel(a, a, sigma).mean() + gaussian_kernel(b, b, sigma).mean()
+    return (within - 2 * gaussian_kernel(a, b, sigma).mean()).item()
 
 
 def chamfer_squared(points_a: Tensor, points_b: Tensor) -> float:
