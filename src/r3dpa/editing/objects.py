@@ -256,9 +256,9 @@ def most_like_first(
     Likeness is the mean cosine between the feature of the object and the features of the part's
     cells, which the feature source takes from the points of the draw. The ``cosine`` of the edits
     cannot replace it: it is of features that the network predicts, which guidance may raise
-    without making an object. Where the object has a box, draws that put few points into it, since
-    their object stands in front of it or behind, come after all others; among the rest, draws come
-    first of which the feature source takes half of these points for the object.
+    without making an object. Where the object has a box, draws come first of whose points in the
+    box the feature source takes half for the object, and draws come last that put few points into
+    it, since their object stands in front of it or behind.
 
     Args:
         edits: Draws of :meth:`SceneEditor.inpaint`.
@@ -296,12 +296,18 @@ def most_like_first(
     if counts:
         points_inside = torch.stack(counts)
         edits = replace(edits, points_inside=points_inside)
-        order = order + 4 * (points_inside >= _FILLED * points_inside.max())
+        order = order + 2 * _fills(points_inside)
     if counts_of_class:
         points_of_class = torch.stack(counts_of_class)
         edits = replace(edits, points_of_class=points_of_class)
-        order = order + 2 * (points_of_class >= _RECOGNISED * points_inside)
+        recognised = points_of_class >= _RECOGNISED * points_inside
+        order = order + 4 * (recognised & _fills(points_of_class * recognised))
     return edits[order.argsort(descending=True, stable=True)]
+
+
+def _fills(counts: Tensor) -> Tensor:
+    """Whether draws fill a box, by the numbers ``(B,)`` of their points in it."""
+    return (counts > 0) & (counts >= _FILLED * counts.max())
 
 
 def _labelled_points(
