@@ -13,9 +13,18 @@ RayIndex = NDArray[np.int64] | slice
 
 
 def generator_for(*key: int | str) -> np.random.Generator:
-    """Random generator of a key of numbers (0 or greater) and words."""
+    """Random generator of a key of numbers (0 or greater) and words.
+
+    Raises:
+        ValueError: If a number is negative or has a fraction.
+    """
     words = [zlib.crc32(part.encode()) if isinstance(part, str) else part for part in key]
-    return np.random.Generator(np.random.Philox(np.random.SeedSequence(words)))
+    try:
+        sequence = np.random.SeedSequence(words)
+    except (TypeError, ValueError) as error:
+        numbers = ", ".join(str(part) for part in key if not isinstance(part, str))
+        raise ValueError(f"seed must be a whole number, 0 or greater, got {numbers}") from error
+    return np.random.Generator(np.random.Philox(sequence))
 
 
 def smooth_field(

@@ -150,7 +150,7 @@ class Simulator:
         )
 
     def scan(self, number: int) -> SimulatedScan:
-        """Scan ``number`` of the drive, 0 or greater; neighbours are 0.1 s apart."""
+        """Scan ``number`` of the drive, 0 to 1,000,000; neighbours are 0.1 s apart."""
         scene = self.street.scene(number, self.sensor.mount_height_m)
         key = (self.street.seed, "effects", self.street.drive, number)
         return simulate_scan(scene, self.sensor, key, self.switches)

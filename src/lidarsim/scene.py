@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from enum import IntEnum
+from numbers import Integral
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -20,12 +21,13 @@ _CLEAR_DRY, _CLEAR_WET = 0.85, 0.10
 _CLEAR_SKY = 0.6
 _MOST_MM_H = 500.0
 
-Rule = Literal["be finite", "be positive", "be 0 or greater"]
+Rule = Literal["be finite", "be positive", "be 0 or greater", "be a whole number, 0 or greater"]
 
 _RULES: dict[Rule, Callable[[float], bool]] = {
     "be finite": math.isfinite,
     "be positive": lambda value: 0 < value < math.inf,
     "be 0 or greater": lambda value: 0 <= value < math.inf,
+    "be a whole number, 0 or greater": lambda value: isinstance(value, Integral) and value >= 0,
 }
 
 

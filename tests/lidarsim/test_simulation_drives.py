@@ -325,7 +325,7 @@ def test_split_of_chosen_drives():
     [
         ({"scans": 0}, "scans must be 1 or greater, got 0"),
         ({"workers": 0}, "workers must be 1 or greater, got 0"),
-        ({"seed": -1}, "seed must be 0 or greater, got -1"),
+        ({"seed": -1}, "seed must be a whole number, 0 or greater, got -1"),
         ({"sensor": "lidar"}, "unknown sensor 'lidar'"),
         ({"drives": ["3"]}, "got 3"),
         ({"effects": {"fogg": "off"}}, r"unknown effect 'fogg'; choose from dual_return, "),

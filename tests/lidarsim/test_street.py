@@ -261,11 +261,19 @@ def test_weather_lasts_and_puddles_lie_on_wet_roads():
     assert set(wet.puddles) & set(Street(5, 2, Conditions(water_film_mm=1.0)).scene(65).puddles)
 
 
-def test_negative_numbers_are_refused():
-    with pytest.raises(ValueError, match="seed must be 0 or greater"):
-        Street(-1, 0)
-    with pytest.raises(ValueError, match="scan must be 0 or greater, got -1"):
-        Street(0, 0).scene(-1)
+@pytest.mark.parametrize("number", [-1, 0.5, "1"])
+def test_negative_and_broken_numbers_are_refused(number):
+    with pytest.raises(ValueError, match=f"seed must be a whole number, 0 .*, got {number}"):
+        Street(number, 0)
+    with pytest.raises(ValueError, match=f"scan must be a whole number in .*, got {number}"):
+        Street(0, 0).scene(number)
+
+
+def test_a_drive_lasts_a_million_scans():
+    street = Street(0, 0)
+    assert street.scene(1_000_000).primitives
+    with pytest.raises(ValueError, match=r"in 0\.\.1000000, got 1000001"):
+        street.scene(1_000_001)
 
 
 def test_a_pavement_lies_a_kerb_above_the_gutter_and_a_verge_begins_level_with_it():

@@ -276,6 +276,8 @@ def test_effects_that_need_a_scene_are_refused_by_name(scan, name):
             lambda s: Weather(visibility_m=60).apply(replace(s, intensity=-1 - s.intensity)),
             "intensity must be 0 or greater",
         ),
+        (lambda s: Weather(visibility_m=60).apply(s, seed=0.5), "seed must be .*, got 0.5"),
+        (lambda s: Weather(visibility_m=60).apply(s, seed=-1), "seed must be .*, got -1"),
         (lambda s: Weather().apply(s, boxes=np.zeros(3)), r"boxes must be \(N, 8\)"),
     ],
 )

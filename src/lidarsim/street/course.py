@@ -27,6 +27,8 @@ _RISE = (-0.022, 0.03)
 # A cross slope that bends on a hill have left dies away by this factor from block to block.
 _LEVELLING = 0.93
 _BLOCKS_PER_TABLE = 32
+# Tables that one call makes, each from the one before: Python limits the depth of recursion.
+_TABLES_PER_CALL = 100
 
 #: Amplitude, length and phase.
 Wave = tuple[float, float, float]
@@ -305,6 +307,8 @@ def _sum(waves: tuple[Wave, ...], s: float) -> float:
 @lru_cache(maxsize=256)
 def _sections(course: Course, table: int) -> tuple[Section, ...]:
     sections: list[Section] = []
+    for earlier in range(0, table, _TABLES_PER_CALL):
+        _sections(course, earlier)
     last = _sections(course, table - 1)[-1] if table else None
     first = table * _BLOCKS_PER_TABLE
     for block in range(first, first + _BLOCKS_PER_TABLE):

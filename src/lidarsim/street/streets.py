@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
+from numbers import Integral
 from typing import NamedTuple
 
 from numpy.random import Generator
@@ -37,6 +38,8 @@ _DETAIL_M = 25.0
 _BLOCKS_PER_DISTRICT = 6
 # Weather lasts this many scans.
 _SCANS_PER_WEATHER = 100
+# A day of driving; the course of a drive is followed from its start.
+_LAST_SCAN = 1_000_000
 # Instance numbers of blocks repeat after 200 blocks = 4.8 km, of actors of one kind in one lane
 # after 1000.
 _MAX_OBJECTS_PER_BLOCK = 256
@@ -69,13 +72,13 @@ class Street:
     weather: Conditions | None = None
 
     def __post_init__(self) -> None:
-        check_fields(self, "be 0 or greater", "seed", "drive")
+        check_fields(self, "be a whole number, 0 or greater", "seed", "drive")
 
     def scene(self, scan: int, sensor_height_m: float = 1.73) -> Scene:
         """Solids within 72 to 96 m along the street, pose and motion, weather and puddles.
 
         Args:
-            scan: Number of the scan in the drive, 0 or greater.
+            scan: Number of the scan in the drive, 0 to 1,000,000.
             sensor_height_m: Frame origin of the sensor above the road.
         """
         weather = self.weather_of(scan)
@@ -111,8 +114,8 @@ class Street:
 
     def weather_of(self, scan: int) -> Conditions:
         """The weather of one scan."""
-        if scan < 0:
-            raise ValueError(f"scan must be 0 or greater, got {scan}")
+        if not (isinstance(scan, Integral) and 0 <= scan <= _LAST_SCAN):
+            raise ValueError(f"scan must be a whole number in 0..{_LAST_SCAN}, got {scan}")
         if self.weather is not None:
             return self.weather
         stretch = scan // _SCANS_PER_WEATHER
