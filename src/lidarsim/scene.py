@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from enum import IntEnum
-from numbers import Integral
+from numbers import Integral, Real
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -213,6 +213,11 @@ class Conditions:
     sun_azimuth_deg: float = 0.0
 
     def __post_init__(self) -> None:
+        for name in (field.name for field in fields(self) if field.name != "clear_sky"):
+            if not isinstance(getattr(self, name), Real):
+                raise ValueError(f"{name} must be a number, got {getattr(self, name)!r}")
+        if self.clear_sky not in (True, False):
+            raise ValueError(f"clear_sky must be True or False, got {self.clear_sky!r}")
         if not self.visibility_m >= 1:
             raise ValueError(
                 f"visibility_m must be 1 or greater (no fog is denser), got {self.visibility_m}"
