@@ -90,13 +90,14 @@ class RecordedScan:
                     f"{name} must have one value for each of {len(self)} points, "
                     f"got the shape {column.shape}"
                 )
-        finite = np.isfinite(self.points).all(axis=1)
+        are_finite = {"points": np.isfinite(self.points).all(axis=1)}
         if self.intensity is not None:
-            finite &= np.isfinite(self.intensity)
-        if num_bad := np.count_nonzero(~finite):
-            raise ValueError(
-                f"{num_bad} of {len(self)} points are NaN or infinite: drop them first"
-            )
+            are_finite["intensities"] = np.isfinite(self.intensity)
+        for what, is_finite in are_finite.items():
+            if num_bad := np.count_nonzero(~is_finite):
+                raise ValueError(
+                    f"{num_bad} of {len(self)} {what} are NaN or infinite: drop these points first"
+                )
         farthest_m = float(np.abs(self.points).max())
         if farthest_m > _FARTHEST_M:
             raise ValueError(

@@ -263,7 +263,8 @@ def test_effects_that_need_a_scene_are_refused_by_name(scan, name):
     ("make", "told"),
     [
         (lambda s: replace(s, points=s.points[:0]), "at least one point"),
-        (lambda s: replace(s, points=s.points * np.nan), "are NaN or infinite: drop them first"),
+        (lambda s: replace(s, points=s.points * np.nan), "points are NaN .*: drop these points"),
+        (lambda s: replace(s, intensity=s.intensity * np.nan), "intensities are NaN or infinite"),
         (lambda s: replace(s, points=s.points * 100), "give metres"),
         (lambda s: replace(s, labels=s.labels[1:]), "labels must have one value for each"),
         (lambda s: Weather().apply(s, effects={"hail": "on"}), "unknown effect 'hail'"),
