@@ -287,7 +287,7 @@ def _are_returns(table: Table) -> NDArray[np.bool_]:
 
 def _read_ply(path: Path, data: bytes, columns: tuple[str, ...]) -> Stored:
     head, mark, body = data.partition(b"end_header")
-    header = (head + mark).decode("ascii", errors="replace").splitlines()
+    header = (head + mark).decode(errors="replace").splitlines()
     words = [line.split() for line in header]
     kind = " ".join(words[1][1:]) if mark and words[0] == ["ply"] and words[1:] else ""
     if kind not in _PLY_KINDS:
@@ -309,7 +309,7 @@ def _read_ply(path: Path, data: bytes, columns: tuple[str, ...]) -> Stored:
 
     def pack(table: Table) -> bytes:
         text = re.sub(r"(?m)^element vertex .*", f"element vertex {len(table)}", "\n".join(header))
-        return f"{text}\n".encode("ascii") + (_text_of(table) if is_text else table.tobytes())
+        return f"{text}\n".encode() + (_text_of(table) if is_text else table.tobytes())
 
     return Stored(f".ply, {kind.split()[0]}", table, pack)
 
@@ -336,6 +336,8 @@ def ply_of(table: Table) -> bytes:
         kind = table.dtype[name].newbyteorder("<")
         code = kind.str.lstrip("|")
         code = code if code in names else "<f8"  # PLY has no 64-bit integers
+        if not name.isascii():
+            raise ScanError(f"column {name!r} cannot be written to .ply, which is ASCII: rename it")
         lines.append(f"property {names[code]} {name.replace(' ', '_')}")
         layout.append((name, code))
     head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]

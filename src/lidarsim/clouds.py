@@ -394,6 +394,9 @@ def _npy_of(cloud: PointCloud, full_scale: float | None) -> bytes:
 def _npz_of(cloud: PointCloud, full_scale: float | None) -> bytes:
     stream, columns = io.BytesIO(), _all_columns(cloud, full_scale)
     others: dict[str, Any] = {name: columns[name] for name in columns if name not in {*"xyz"}}
+    for name in ("file", "xyz"):
+        if name in others:
+            raise ScanError(f"column {name!r} cannot be written to .npz: rename it")
     np.savez_compressed(stream, xyz=cloud.points, **others)
     return stream.getvalue()
 

@@ -249,6 +249,24 @@ def test_bad_files_are_named_in_one_line(tmp_path, name):
     assert "\n" not in str(raised.value)
 
 
+@pytest.mark.parametrize(("name", "file"), [("höhe", "a.ply"), ("file", "a.npz"), ("xyz", "a.npz")])
+def test_a_column_that_a_format_cannot_name_is_refused(tmp_path, name, file):
+    cloud = PointCloud.of(POINTS, **{name: RING})
+    with pytest.raises(ScanError, match=rf"column '{name}' cannot be written to {file[1:]}"):
+        write_cloud(tmp_path / file, cloud)
+    assert not (tmp_path / file).exists()
+
+
+def test_a_comment_in_utf_8_stays_in_the_header_of_a_ply(tmp_path):
+    write_cloud(tmp_path / "a.ply", PointCloud.of(POINTS))
+    head, _, rest = (tmp_path / "a.ply").read_bytes().partition(b"element")
+    (tmp_path / "a.ply").write_bytes(head + "comment Höhe\nelement".encode() + rest)
+    cloud = read_cloud(tmp_path / "a.ply")
+    write_cloud(tmp_path / "b.ply", cloud.changed(np.arange(10), cloud.points[:10]))
+    assert "comment Höhe\n".encode() in (tmp_path / "b.ply").read_bytes()
+    np.testing.assert_array_equal(read_cloud(tmp_path / "b.ply").points, POINTS[:10])
+
+
 def test_columns_can_be_named_and_points_without_return_dropped(tmp_path):
     path = tmp_path / "a.bin"
     path.write_bytes(NAN.tobytes())
