@@ -9,7 +9,7 @@ from typing import Literal
 from lidarsim.cloud_formats import ScanError
 from lidarsim.clouds import WRITERS, PointCloud, find_files, read_cloud, suffix_of
 from lidarsim.clouds_bag import is_bag, read_bag
-from lidarsim.io import write_bytes
+from lidarsim.io import number_of, write_bytes
 from lidarsim.rings import rings_of
 from lidarsim.weather import recorded_scan
 
@@ -63,7 +63,7 @@ def convert(
             write_bytes(target.with_name(f"{_stem(target)}.label"), labels)
         write_bytes(target, content)
         num_written += 1
-    return f"{num_written} scans written to {out} as {suffix}"
+    return f"{number_of(num_written, 'scan')} written to {out} as {suffix}"
 
 
 def _targets(source: Path, out: Path, suffix: str) -> dict[Path, Path]:

@@ -25,7 +25,7 @@ from lidarsim.drive_files import (
     weather_to_dict,
     write,
 )
-from lidarsim.io import differences, in_processes, json_values, only_writer, text_table
+from lidarsim.io import differences, in_processes, json_values, number_of, only_writer, text_table
 from lidarsim.scan import Simulator, check_switches
 from lidarsim.scene import Conditions, Semantic
 from lidarsim.sensors.files import load_sensor
@@ -79,8 +79,8 @@ class SimulationReport:
             rows.append([name, *counts, f"{total.rays_per_scan:.0f}", total.why])
         table = text_table(rows, [*heads, "why, in the first scan"], "lrrrrl", "plain")
         per_drive = ", ".join(f"{drive} {num}" for drive, num in self.scans_per_drive.items())
-        num_scans = sum(self.scans_per_drive.values())
-        lines = [f"{num_scans} scans ({per_drive}), {self.num_written} of them simulated now"]
+        scans = number_of(sum(self.scans_per_drive.values()), "scan")
+        lines = [f"{scans} ({per_drive}), {self.num_written} of them simulated now"]
         if self.num_empty:
             lines.append(
                 f"{self.num_empty} of them hold no points: in this weather the sensor sees nothing"

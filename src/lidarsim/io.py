@@ -273,6 +273,11 @@ def first_line(error: BaseException) -> str:
     return str(error).partition("\n")[0] or type(error).__name__
 
 
+def number_of(count: int, noun: str) -> str:
+    """``1 scan``, ``2 scans``: a count with its noun."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
 def refuse_name(name: object) -> str | None:
     """Reason why a name from a file must not become part of a path; None for ``a/b/c``."""
     if not isinstance(name, str) or not name.isprintable() or not 0 < len(name) <= 1024:

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lidarsim.divergences import curve_rmse, jensen_shannon, wasserstein_1
-from lidarsim.io import text_table
+from lidarsim.io import number_of, text_table
 from lidarsim.scan_statistics import (
     BEAMS,
     BEV_EXTENT_M,
@@ -353,7 +353,7 @@ def _describe_drives(
     name: str, drives: Mapping[str, ScanStatistics], pooled: ScanStatistics
 ) -> str:
     sizes = [statistics.num_scans for statistics in drives.values()]
-    total = f"{name}: {_plural(pooled.num_scans, 'scan')} of {_plural(len(drives), 'drive')}"
+    total = f"{name}: {number_of(pooled.num_scans, 'scan')} of {number_of(len(drives), 'drive')}"
     if len(sizes) > 1:
         low, high = min(sizes), max(sizes)
         total += f", {low} each" if low == high else f", {low} to {high} each"
@@ -365,7 +365,3 @@ def _describe_drives(
     }
     left_out = [f"{count} {what}" for what, count in parts.items() if count]
     return f"{total}; left out where needed: {', '.join(left_out)}" if left_out else total
-
-
-def _plural(count: int, noun: str) -> str:
-    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"

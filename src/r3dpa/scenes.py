@@ -36,6 +36,7 @@ from r3dpa.geometry import (
     view_limits_deg,
     view_of,
 )
+from r3dpa.io import number_of
 
 _PICTURES, _PAGES = 4, 8  # scenes that a notebook cell shows
 _MOST_OUTSIDE = 0.2  # share of the points of a scan that are outside the field of view
@@ -215,7 +216,8 @@ class SceneBatch:
 
     def __repr__(self) -> str:
         about = _describe(self.range_m, self.intensity, self.labels)
-        return f"{type(self).__name__}({len(self)} scenes, {about}, {self.nfe} evaluations each)"
+        count = number_of(len(self), "scene")
+        return f"{type(self).__name__}({count}, {about}, {self.nfe} evaluations each)"
 
     def __len__(self) -> int:
         """Number of scenes B."""

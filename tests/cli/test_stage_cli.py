@@ -273,7 +273,7 @@ def test_one_command_simulates_then_adds_scans_and_the_grids_of_a_teacher(tmp_pa
         "--data.init_args.grid_size=[2, 8]",
     ]
     main([*words, "--data.init_args.num_scans=2"])
-    assert "1 scans to train, 1 held out; no feature grids" in capsys.readouterr().out
+    assert "1 scan to train, 1 held out; no feature grids" in capsys.readouterr().out
     words.append("--data.init_args.num_scans=3")
     weights = feature_source("waffleiron-s").shipped
     extractor = f"--data.init_args.extractor.init_args.weights={weights}"

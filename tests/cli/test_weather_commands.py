@@ -185,16 +185,17 @@ def test_scans_and_results_that_have_changed_are_made_again(pair, tmp_path, caps
     assert content(out) == content(tmp_path / "fresh")
 
 
-def test_results_of_scans_that_are_gone_are_refused(pair):
+def test_results_of_scans_that_are_gone_are_refused(pair, capsys):
     source, out = pair
     before = content(out)
     (source / "b.bin").unlink()
-    with pytest.raises(ValueError, match=r"1 scans that .*in does not hold any more, .*out/b\.bin"):
+    with pytest.raises(ValueError, match=r"1 scan that .*in does not hold any more, .*out/b\.bin"):
         weather(source, out, *FOG)
     assert content(out) == before
     (out / "b.bin").unlink()
     weather(source, out, *FOG, "--show", 0)
     assert [line["scan"] for line in report(out)] == ["a.bin"]
+    assert f"1 scan in {out}, 0 of them written now" in capsys.readouterr().out
 
 
 def test_scans_one_by_one_share_a_report(pair, tmp_path):

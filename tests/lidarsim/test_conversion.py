@@ -46,6 +46,9 @@ def test_a_folder_to_nuscenes_and_back_is_the_same(folder, points, tmp_path, cap
     assert cloud.labels.tolist() == list(range(len(points)))
     convert(tmp_path / "five", tmp_path / "back", "--to", "bin")
     assert (tmp_path / "back/b/1.bin").read_bytes() == points.tobytes()
+    capsys.readouterr()
+    convert(folder / "b/1.bin", tmp_path / "one.ply")
+    assert capsys.readouterr().out.startswith("1 scan written to")
 
 
 def test_named_columns_and_full_scale(points, tmp_path):

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -176,6 +177,8 @@ def test_a_larger_data_set_serves_a_smaller_request(tmp_path):
     before = files_of(tmp_path)
     report = simulate(tmp_path, 3, **request)
     assert report.scans_per_drive == {"0003": 1, "0009": 1, "0000": 1}
+    assert "\n3 scans (0003 1, 0009 1, 0000 1), " in str(report)
+    assert "\n1 scan (0003 1), " in str(replace(report, scans_per_drive={"0003": 1}))
     assert (report.num_written, files_of(tmp_path)) == (0, before)
     for number in (0, 2):
         (points_folder(tmp_path, "0003") / "data" / f"{number:010d}.bin").unlink()

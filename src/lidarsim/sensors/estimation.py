@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from lidarsim.clouds import find_files
 from lidarsim.ground import ground_around, plane_of
+from lidarsim.io import number_of
 from lidarsim.sensors.beams import MORE_THAN_A_TURN, BeamFit, ColumnFit, fit_beams, fit_columns
 from lidarsim.sensors.files import SensorFile, write_sensor
 from lidarsim.sensors.recordings import (
@@ -86,7 +87,7 @@ class SensorEstimate:
 
     def save(self, path: str | Path, name: str = "") -> None:
         """Write a YAML file that ``load_sensor`` reads."""
-        source = f"estimated from {self.num_scans} scans"
+        source = f"estimated from {number_of(self.num_scans, 'scan')}"
         write_sensor(path, SensorFile(name or Path(path).stem, source, self.sensor), self.to_dict())
 
     def to_dict(self) -> dict[str, Any]:

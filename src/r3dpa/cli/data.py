@@ -145,7 +145,7 @@ def objects(
     from r3dpa.editing.objects import object_library
     from r3dpa.features import feature_source
     from r3dpa.generation import SceneGenerator
-    from r3dpa.io import text_table, usable_device
+    from r3dpa.io import number_of, text_table, usable_device
     from r3dpa.scene_files.generated import feature_source_of
 
     source = feature_source_of(read_checkpoint(ckpt))
@@ -175,7 +175,8 @@ def objects(
     ]
     table = text_table(rows, ["class", "scans", "cells", "points", "spread"], "rrrrr", "plain")
     spread = "Spread: mean of 1 - cosine between the class's feature and its cells."
-    return f"{table}\n{spread}\n{len(scans)} scans, features of {source}, written to {out}"
+    count = number_of(len(scans), "scan")
+    return f"{table}\n{spread}\n{count}, features of {source}, written to {out}"
 
 
 def sensors() -> str:

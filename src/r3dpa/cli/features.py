@@ -17,6 +17,7 @@ from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.data.range_images import SimulatedImageDataModule
 from r3dpa.feature_names import SOURCES
 from r3dpa.features.scalr import feature_source
+from r3dpa.io import number_of
 from r3dpa.modules.feature_extraction import extract_features
 from r3dpa.modules.stage import check_trainer
 
@@ -64,7 +65,7 @@ def prepare(args: list[str]) -> None:
     grids = (
         "no feature grids" if data.features_dir is None else f"feature grids: {data.features_dir}"
     )
-    sys.stdout.write(f"{len(train)} scans to train, {len(val)} held out; {grids}\n")
+    sys.stdout.write(f"{number_of(len(train), 'scan')} to train, {len(val)} held out; {grids}\n")
 
 
 def read_data(source: Path, columns: Sequence[str] = ()) -> LidarDataModule:

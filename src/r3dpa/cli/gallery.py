@@ -42,7 +42,7 @@ def gallery(
     from r3dpa.checkpoints import read_checkpoint
     from r3dpa.cli.features import read_data
     from r3dpa.generation import SceneGenerator
-    from r3dpa.io import usable_device, write_text
+    from r3dpa.io import number_of, usable_device, write_text
     from r3dpa.scene_files.shown_edits import ShownEdits
     from r3dpa.viz.gallery import gallery_page
 
@@ -58,4 +58,4 @@ def gallery(
     page = gallery_page(generator, str(ckpt), num, edit, module, seed, batch_size)
     html = page.html("r3dpa gallery")
     write_text(out, html)
-    return f"open {out}: {len(page.scans)} scenes, {len(html) / 1e6:.0f} MB"
+    return f"open {out}: {number_of(len(page.scans), 'scene')}, {len(html) / 1e6:.0f} MB"

@@ -20,7 +20,7 @@ from lidarsim.clouds import files_below, find_files, read_cloud, suffix_of
 from lidarsim.scan_files import read_scan, rows_of
 from r3dpa.data.store import ItemKey
 from r3dpa.geometry import LidarSensor
-from r3dpa.io import refuse_name
+from r3dpa.io import number_of, refuse_name
 
 Split = Literal["train", "val"]
 T = TypeVar("T")
@@ -217,12 +217,15 @@ def check(path: str | Path) -> tuple[str, bool]:
     with ThreadPool(8) as pool:
         results = list(tqdm(pool.imap(examine, scans), total=len(scans), unit="scan", disable=None))
     problems += [result for result in results if isinstance(result, str)]
-    lines = [*(f"{drive}: {count} scans" for drive, count in counts.items()), *problems]
+    lines = [
+        *(f"{drive}: {number_of(count, 'scan')}" for drive, count in counts.items()),
+        *problems,
+    ]
     if limits := [result for result in results if not isinstance(result, str)]:
         low, high = min(low for low, _ in limits), max(high for _, high in limits)
         outside = " (expected 0..1)" if low < 0 or high > 1 else ""
         lines.append(f"intensity: {low:.3g}..{high:.3g}{outside}")
-    in_drives = f" in {_number_of(len(counts), 'drive')}" if scans else ""
+    in_drives = f" in {number_of(len(counts), 'drive')}" if scans else ""
     lines.append(f"{root}: {verdict(len(scans), len(problems), in_drives)}")
     return "\n".join(lines), not problems
 
@@ -230,11 +233,7 @@ def check(path: str | Path) -> tuple[str, bool]:
 def verdict(num_scans: int, num_problems: int, place: str = "") -> str:
     """Return how many scans were checked, and whether they can be used."""
     usable = f"problems: {num_problems}" if num_problems else "all usable"
-    return f"{_number_of(num_scans, 'scan')}{place}, {usable}"
-
-
-def _number_of(num: int, noun: str) -> str:
-    return f"{num} {noun}" if num == 1 else f"{num} {noun}s"
+    return f"{number_of(num_scans, 'scan')}{place}, {usable}"
 
 
 def _compare_layout(root: Path, counts: dict[str, int]) -> list[str]:

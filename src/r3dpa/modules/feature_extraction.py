@@ -27,6 +27,7 @@ from r3dpa.data.loaders import plain_loader
 from r3dpa.data.scans import Scan
 from r3dpa.data.store import StoreWriter
 from r3dpa.geometry import Projection
+from r3dpa.io import number_of
 
 
 class FeatureExtraction(LightningModule):
@@ -158,8 +159,8 @@ def extract_features(
             scans = list(todo.missing)
             stores = ", ".join(str(folder / f"{h}x{w}") for h, w in todo.stores)
             sys.stdout.write(
-                f"feature grids of {extractor.name}: {len(scans)} scans to do, {todo.num_kept} "
-                f"done; {todo.num_bytes / 1e9:.3g} GB needed, in {stores}\n"
+                f"feature grids of {extractor.name}: {number_of(len(scans), 'scan')} to do, "
+                f"{todo.num_kept} done; {todo.num_bytes / 1e9:.3g} GB needed, in {stores}\n"
             )
             sys.stdout.flush()  # into a log file at once
         extraction = FeatureExtraction(

@@ -26,6 +26,7 @@ from r3dpa.io import (
     differences,
     in_processes,
     json_values,
+    number_of,
     only_writer,
 )
 from r3dpa.scene_files.options import FolderOptions
@@ -171,8 +172,8 @@ def _check_out(root: Path, out: Path, files: list[Path], request: dict[str, Any]
     earlier = {root / name: out / name for name in _lines(out) if (out / name).is_file()}
     if gone := [result for path, result in earlier.items() if not path.is_file()]:
         raise ValueError(
-            f"{out} holds results of {len(gone)} scans that {root} does not hold any more, such as "
-            f"{gone[0]}: delete them, or give another --out"
+            f"{out} holds results of {number_of(len(gone), 'scan')} that {root} does not hold any "
+            f"more, such as {gone[0]}: delete them, or give another --out"
         )
     refuse_shared_labels({*files, *earlier})
 
@@ -211,9 +212,14 @@ def _summary(lines: list[dict[str, Any]], num_now: int, out: Path) -> str:
     """Formats, shares of points and effects of all scans."""
     kinds = {line["file"].partition(")")[0]: line["file"] for line in reversed(lines)}
     num_points = sum(line["points"] for line in lines)
-    texts = [f"{len(lines)} scans in {out}, {num_now} of them written now", *kinds.values()]
+    texts = [
+        f"{number_of(len(lines), 'scan')} in {out}, {num_now} of them written now",
+        *kinds.values(),
+    ]
     scales = Counter(line["intensity"].split(": ")[1] for line in lines if "intensity" in line)
-    texts += [f"intensity: {scale}, in {num} scans" for scale, num in scales.most_common(4)]
+    texts += [
+        f"intensity: {scale}, in {number_of(num, 'scan')}" for scale, num in scales.most_common(4)
+    ]
     for key in ("lost", "moved", "dimmed", "added"):
         causes = Counter[str]()
         for line in lines:
@@ -221,7 +227,9 @@ def _summary(lines: list[dict[str, Any]], num_now: int, out: Path) -> str:
         shares = [f"{n / num_points:.2%} {cause}".strip() for cause, n in causes.items() if n]
         texts.append(f"{key}: {', '.join(shares) or 'no point'}")
     ran = Counter((name, why) for line in lines for name, why in line["effects"].items())
-    texts += [f"{name}: {why}, in {num} scans" for (name, why), num in ran.most_common(12)]
+    texts += [
+        f"{name}: {why}, in {number_of(num, 'scan')}" for (name, why), num in ran.most_common(12)
+    ]
     page = f"; open {out / _PAGE}" if (out / _PAGE).exists() else ""
     return "\n".join([*texts, f"{out / _REPORT} has a line for each{page}"])
 

@@ -30,7 +30,7 @@ from r3dpa.geometry import (
     points_of,
     values_at_returns,
 )
-from r3dpa.io import in_processes
+from r3dpa.io import in_processes, number_of
 from r3dpa.scene_files.edits import EditSession, ScanView
 from r3dpa.scene_files.options import EditOptions
 
@@ -297,9 +297,8 @@ def _summary(num_scans: int, nfe: int, errors: dict[str, Any], out: Path) -> str
             f"mean error of the held-out returns: completed {completed:.2f} m, linear "
             f"interpolation {linear:.2f} m, nearest beam or column {nearest:.2f} m"
         )
-    scans = "1 scan" if num_scans == 1 else f"{num_scans} scans"
     return (
-        f"complete: {scans} in {out / _SCANS}, {nfe} network evaluations each; all points of the "
-        f"input, then the generated ones\n{text}\n"
+        f"complete: {number_of(num_scans, 'scan')} in {out / _SCANS}, {nfe} network evaluations "
+        f"each; all points of the input, then the generated ones\n{text}\n"
         f"open {out / 'edit.png'} and {out / 'edit.html'}"
     )

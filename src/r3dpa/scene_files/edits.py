@@ -28,7 +28,7 @@ from r3dpa.editing.regions import check_mask
 from r3dpa.features import feature_source
 from r3dpa.flow.sampler import SamplerConfig
 from r3dpa.geometry import Pixels, in_range, in_view, project_pixels
-from r3dpa.io import atomic_path, json_values, usable_device, write_text
+from r3dpa.io import atomic_path, json_values, number_of, usable_device, write_text
 from r3dpa.nn import VelocityNetwork
 from r3dpa.scene_files.generated import feature_source_of, provenance
 from r3dpa.scene_files.options import EditOptions
@@ -219,7 +219,7 @@ class EditSession:
             if request[name] is not None:
                 counts += f"{about}: {', '.join(map(str, request[name]))}\n"
         return (
-            f"{command}: {self.num} scene{'s' * (self.num != 1)} in {options.out}, {result.nfe} "
+            f"{command}: {number_of(self.num, 'scene')} in {options.out}, {result.nfe} "
             f"network evaluations each, {seconds:.3g} s; errors are in metadata.json\n{counts}"
             f"open {options.out / 'edit.png'} and {options.out / 'edit.html'}"
         )

@@ -65,7 +65,7 @@ def sample(
     from r3dpa.data.scene_writer import SceneWriter
     from r3dpa.generation import SamplerConfig, geometry_of
     from r3dpa.geometry import projection_for
-    from r3dpa.io import usable_device
+    from r3dpa.io import number_of, usable_device
     from r3dpa.nn import ThinDecoder
     from r3dpa.scene_files.generated import (
         autoguidance_of,
@@ -135,8 +135,9 @@ def sample(
     note = f"sampler: {generator.sampler.summary}"
     if not given and generator.sampler == SamplerConfig.of_quality(quality or "good"):
         note = SamplerConfig.quality_line(quality or "good")  # measured, unlike a baseline's
-    number = "1 scene" if num == 1 else f"{num} scenes"
-    line = f"{number} in {files.out}: {measured['nfe']:.5g} network evaluations each"
+    line = (
+        f"{number_of(num, 'scene')} in {files.out}: {measured['nfe']:.5g} network evaluations each"
+    )
     if measured["drawn_by_last_run"]:
         line += f", {measured['seconds_per_scene']:.3g} s per scene"
     if seen_by is not None:

@@ -13,6 +13,7 @@ from tqdm import tqdm
 from lidarsim import Semantic
 from lidarsim.weather import Weather
 from r3dpa.geometry import Projection, points_of, range_image
+from r3dpa.io import number_of
 from r3dpa.metrics.nearest import nearest_images
 from r3dpa.viz.page import PageScan, Tile, scan_page
 from r3dpa.viz.pictures import range_image_picture
@@ -100,7 +101,9 @@ def gallery_page(
     scenes = [scene for batch in batches for scene in batch]
     scenes_m = torch.stack([scene.range_m.cpu() for scene in scenes])
     labels = [None if scene.labels is None else scene.point_labels for scene in scenes]
-    page.about.append(f"{source}: {num} scenes in seed order, {batches[0].nfe} evaluations each.")
+    page.about.append(
+        f"{source}: {number_of(num, 'scene')} in seed order, {batches[0].nfe} evaluations each."
+    )
     if data is None:
         for number, range_m in enumerate(scenes_m):
             page.add("Scenes", f"seed {number}", range_m, labels=labels[number])
