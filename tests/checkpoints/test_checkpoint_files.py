@@ -72,7 +72,10 @@ class TestOurFiles:
     def test_nothing_is_overwritten_unless_asked(self, checkpoint, tmp_path):
         path = save_checkpoint(checkpoint, tmp_path / "a.safetensors")
         before = path.read_bytes()
-        with pytest.raises(ValueError, match=r"a.safetensors, .*a.yaml exists"):
+        with pytest.raises(
+            ValueError,
+            match=r"a.safetensors and .*a.yaml exist already; .*--overwrite true .*=True",
+        ):
             save_checkpoint(replace(checkpoint, networks={}), path)
         assert path.read_bytes() == before
         save_checkpoint(replace(checkpoint, step=31), path, overwrite=True)

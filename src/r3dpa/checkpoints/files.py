@@ -299,7 +299,11 @@ def _check_same_latents(checkpoint: Checkpoint, other: Checkpoint) -> None:
 def _refuse_existing(paths: list[Path], overwrite: bool) -> None:
     existing = [str(path) for path in paths if path.exists()]
     if existing and not overwrite:
-        raise ValueError(f"{', '.join(existing)} exists already; choose another name or overwrite")
+        exist = "exists" if len(existing) == 1 else "exist"
+        raise ValueError(
+            f"{' and '.join(existing)} {exist} already; give another name, or --overwrite true "
+            "(overwrite=True in Python)"
+        )
 
 
 def _neighbour(vae: Path, kind: str) -> Path:
