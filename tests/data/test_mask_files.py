@@ -39,6 +39,12 @@ def test_a_picture_that_is_no_mask_is_named(tmp_path, sensor):
     cut.write_bytes(drawn(tmp_path / "a.png", np.full((8, 32), 255, np.uint8)).read_bytes()[:50])
     text = tmp_path / "text.png"
     text.write_text("no picture")
-    for path in (cut, text, tmp_path / "absent.png", tmp_path):
-        with pytest.raises(ValueError, match=f"{path.name}: cannot be read as a picture"):
+    array = tmp_path / "mask.npy"
+    np.save(array, np.ones((8, 32), bool))
+    for path in (cut, text, array, tmp_path / "absent.png", tmp_path):
+        with pytest.raises(
+            ValueError,
+            match=f"{path.name}: cannot be read as a picture .*; give a picture, such as a .png, "
+            "of 8 x 32 pixels",
+        ):
             read_mask(path, sensor)

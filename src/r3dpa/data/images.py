@@ -199,5 +199,8 @@ def read_mask(path: str | Path, sensor: LidarSensor) -> Tensor:
                 )
             pixels = np.asarray(picture.convert("RGBA"))
     except (OSError, SyntaxError, Image.DecompressionBombError) as error:
-        raise ValueError(f"{path}: cannot be read as a picture ({first_line(error)})") from error
+        raise ValueError(
+            f"{path}: cannot be read as a picture ({first_line(error)}); give a picture, such as "
+            f"a .png, of {sensor.beams} x {sensor.columns} pixels, white inside the mask"
+        ) from error
     return torch.from_numpy((pixels[..., :3].max(axis=2) >= _BRIGHT) & (pixels[..., 3] >= _BRIGHT))
