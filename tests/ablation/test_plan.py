@@ -94,6 +94,17 @@ def test_the_name_depends_on_the_training_not_on_the_test_or_the_folder(tmp_path
         assert (names_of(plan.stages) == usual) == (section == "scorer")
 
 
+def test_an_unknown_released_row_is_refused_before_anything_is_planned():
+    def resolve(words):
+        pytest.fail(f"{words} was planned")
+
+    scale = TABLES / "scale" / "demo.yaml"
+    with pytest.raises(
+        ValueError, match=r"--released\.nope: unknown row; choose from .*ultralidar"
+    ):
+        make_plan(TABLES, scale, (0,), Path("out"), resolve, released={"nope": Path("x")})
+
+
 def test_released_files_stand_for_trainings(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # jobs write their configuration into the folder of the plan
     weights, samples = tmp_path / "r2dm.pth", tmp_path / "samples"

@@ -153,19 +153,25 @@ def make_plan(
     files = sorted(tables.glob("*.yaml")) if tables.is_dir() else [tables.with_suffix(".yaml")]
     if not files:
         raise ValueError(f"{tables} holds no table; give a YAML file, or a folder of them")
-    planned = [_plan_table(file, planner, seeds, released) for file in files]
-    keys = [row.key for table in planned for row in table.rows]
+    contents = {file: _read(file, ("caption", "rows"), ("better", "alike")) for file in files}
+    keys = [key for content in contents.values() for key in content["rows"]]
     for key in released:
         if key not in keys:
             raise ValueError(f"--released.{key}: unknown row; choose from {', '.join(keys)}")
+    planned = [
+        _plan_table(file, content, planner, seeds, released) for file, content in contents.items()
+    ]
     options = shlex.split(about.get("reference", ""))
     return Plan(out, scale.stem, about["about"], options, tuple(seeds), planned)
 
 
 def _plan_table(
-    file: Path, planner: _Planner, seeds: Sequence[int], released: Mapping[str, Path]
+    file: Path,
+    about: Mapping[str, Any],
+    planner: _Planner,
+    seeds: Sequence[int],
+    released: Mapping[str, Path],
 ) -> Table:
-    about = _read(file, ("caption", "rows"), ("better", "alike"))
     rows: dict[str, Row] = {}
     for key, row in about["rows"].items():
         where = f"{file}: {key}"
