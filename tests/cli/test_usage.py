@@ -227,6 +227,8 @@ def test_absent_weights_of_an_extractor_are_named_in_one_line(tmp_path, monkeypa
         ("--guidance_interval 0.2", "--guidance_interval: expected a tuple with 2 elements"),
         ("--formats bin plx", "--formats: unknown value 'plx'; choose from bin, ply, npz"),
         ("--eta x", "--eta: expected float, got 'x'"),
+        ("--num 1e9", "--num: expected a whole number in digits, got '1e9'"),
+        ("--seed 1.5", "--seed: expected a whole number in digits, got '1.5'"),
     ],
 )
 def test_a_message_says_what_is_accepted(words, message, capsys):

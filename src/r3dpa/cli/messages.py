@@ -13,6 +13,7 @@ from jsonargparse import ArgumentParser
 
 ALLOWED_PACKAGES = ("r3dpa", "lidarsim", "lightning", "torch.nn", "torch.optim")
 """Packages whose classes a configuration may name without ``--allow_import``."""
+_NO_INTEGER = "invalid literal for int() with base 10: "
 _REQUIRED, _UNKNOWN = "the following arguments are required: ", "unrecognized arguments: "
 
 
@@ -107,6 +108,8 @@ def _plain(reason: str) -> str:
     if limit:
         bound = f"{limit.removeprefix('=')} or greater" if "=" in limit else f"above {limit}"
         return f"expected a number {bound}, got {number}"
+    if expected.startswith(_NO_INTEGER):
+        return f"expected a whole number in digits, got {expected.removeprefix(_NO_INTEGER)}"
     if value:
         expected = f"{expected[0].lower()}{expected[1:]}, got '{value}'"
     return expected
