@@ -373,6 +373,19 @@ def test_masks_of_another_shape_are_refused(editor, scan, shape):
             edit(scan, mask, 1)
 
 
+@pytest.mark.parametrize(
+    ("feature", "given"),
+    [
+        (torch.ones(9), r"shape \(9,\) with 0 not finite"),
+        (torch.full((8,), torch.nan), r"shape \(8,\) with 8 not finite"),
+        (torch.ones(1), r"shape \(1,\) with 0"),
+    ],
+)
+def test_features_of_no_object_are_refused(editor, scan, feature, given):
+    with pytest.raises(ValueError, match=rf"feature must be \(8,\) finite numbers, .*{given}"):
+        editor.inpaint(scan, MASK, 1, feature=feature)
+
+
 def test_images_that_are_no_scans_are_not_encoded(editor, scan):
     images = torch.stack([scan, scan.roll(5, dims=1)])
     single = editor.encode(images[1])

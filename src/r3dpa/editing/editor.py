@@ -219,6 +219,12 @@ class SceneEditor:
             start: Time that the way back starts from, in (0, 1]; below 1 part of the content stays.
             dilation: Rings of tokens around the mask that are generated anew as well.
         """
+        width = self._sit.feature_dim
+        if feature is not None and not (feature.shape == (width,) and feature.isfinite().all()):
+            raise ValueError(
+                f"feature must be ({width},) finite numbers, as the features of the model, got "
+                f"shape {tuple(feature.shape)} with {int((~feature.isfinite()).sum())} not finite"
+            )
         times, pixels = self.settings.times(start), self.pixels(scan)
         pixel_mask = self._checked_mask(pixel_mask, "mask")
         tokens = token_mask(pixel_mask, self._sit.grid_size, dilation=dilation)
