@@ -262,6 +262,19 @@ def test_refused_features_leave_the_state():
     assert metric.count("generated") == len(metric.subset("generated")[0]) == 0
 
 
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+@pytest.mark.parametrize("real", [True, False])
+@pytest.mark.parametrize("name", ["ranges", "mmd", "baselines"])
+def test_broken_ranges_are_refused_with_the_results(name, real, value):
+    metric, broken = updated(metric_of(name), name), images(real)
+    broken[1, 2, :3] = value
+    metric.update(broken, real=real)
+    with pytest.raises(ValueError, match="range images hold 3 NaN or infinite values"):
+        metric.compute()
+    metric.reset()
+    assert updated(metric, name).compute() == pytest.approx(expected(name))
+
+
 @pytest.mark.parametrize("name", ["frechet", "mmd"])
 def test_names_that_are_not_one_per_scene_leave_the_state(name):
     metric, scenes = metric_of(name), data(name, True)

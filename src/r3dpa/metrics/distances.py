@@ -307,11 +307,18 @@ class RangeHistogramDistance(_Histograms):
     Intervals leave out each of ``num_groups`` groups of generated scenes in turn.
     """
 
+    num_broken: Tensor
+
     def __init__(self, range_max_m: float, num_groups: int = 1) -> None:
         super().__init__(math.ceil(range_max_m / RANGE_BIN_M), num_groups, torch.int64)
+        self.add_state("num_broken", torch.zeros((), dtype=torch.int64), "sum")
 
     def update(self, range_m: Tensor, real: bool) -> None:
-        """Add range images ``(B, H, W)`` in metres, not above 0 without a return."""
+        """Add range images ``(B, H, W)`` in metres, not above 0 without a return.
+
+        NaN and infinity are refused with the results: here it would wait for the GPU.
+        """
+        self.num_broken += (~(range_m < math.inf)).sum().to(self.num_broken.device)
         bins, groups = self._groups(real, len(range_m))
         width = bins.shape[1]
         index = (range_m.flatten(1) / RANGE_BIN_M).long().clamp(0, width - 1)
@@ -320,7 +327,12 @@ class RangeHistogramDistance(_Histograms):
         bins.view(-1).index_add_(0, index.flatten().to(bins.device), returns.to(bins))
 
     def results(self, resampling: Resampling) -> list[MetricResult]:
-        """Return W1."""
+        """Return W1.
+
+        Raises:
+            ValueError: If a range is NaN or infinite.
+        """
+        _refuse_broken(int(self.num_broken))
         real, groups = self.real_bins.double().cpu().numpy(), self.generated_bins.double()
 
         def distance(counts: Tensor) -> float:
@@ -349,8 +361,14 @@ class _ImageMetric(SceneMetric):
         return [points_of(image, projection, corner) for image in images]
 
     def clouds(self, side: str) -> list[Tensor]:
-        """Return the points ``(P, 3)`` of each scene in the states."""
-        return self.points_of_images(self.subset(side)[1])
+        """Return the points ``(P, 3)`` of each scene in the states.
+
+        Raises:
+            ValueError: If a range is NaN or infinite.
+        """
+        images = self.subset(side)[1]
+        _refuse_broken(int((~(images < math.inf)).sum()))
+        return self.points_of_images(images)
 
 
 class MinimumMatchingDistance(_ImageMetric):
@@ -450,6 +468,14 @@ class BaselineDistances(_ImageMetric):
         ends = resampling.of_mean(nearest)
         mean, note = nearest.mean().item(), OVER_REAL_SCANS
         return [*rows, self._row("MMD 0.5 m", mean, counts, interval=ends, note=note)]
+
+
+def _refuse_broken(num_broken: int) -> None:
+    if num_broken:
+        raise ValueError(
+            f"the range images hold {num_broken} NaN or infinite values; repair the generator, or "
+            "leave the scenes out and report it"
+        )
 
 
 def _point_histograms(clouds: Sequence[Tensor]) -> Tensor:
