@@ -143,6 +143,7 @@ def test_points_and_images_of_wrong_shapes_are_refused():
     projection, points = SphericalProjection(SMALL), torch.zeros(5, 3)
     for function, arguments, message in (
         (projection.pixel_of, (torch.zeros(7, 4),), r"\(7, 4\)"),
+        (range_image, (points.numpy(), projection), "got ndarray; torch.from_numpy makes one"),
         (range_image, (torch.zeros(2, 2, 5, 3), projection), r"\(2, 2, 5, 3\)"),
         (range_image, (points, projection, torch.ones(4, 1)), r"values must be \(5, F\).*\(4, 1\)"),
         (range_image, (points, projection, torch.ones(6, 1)), r"values must be \(5, F\).*\(6, 1\)"),

@@ -158,7 +158,7 @@ def range_image(
         or None.
 
     Raises:
-        ValueError: If points or values have another shape.
+        ValueError: If points are no tensor, or points or values have another shape.
     """
     check_points(points)
     if points.ndim not in (2, 3):

@@ -11,7 +11,12 @@ EMPTY_RANGE_M = -1.0  # a pixel without a return
 
 
 def check_points(points: Tensor) -> None:
-    """Refuse points whose last axis is not x, y, z with a ValueError."""
+    """Refuse points that are no tensor, or whose last axis is not x, y, z, with a ValueError."""
+    if not isinstance(points, Tensor):
+        raise ValueError(
+            f"points must be a tensor, got {type(points).__name__}; torch.from_numpy makes one of "
+            "an array"
+        )
     if points.ndim < 1 or points.shape[-1] != 3:
         raise ValueError(f"points must be (..., 3) x, y, z, got shape {tuple(points.shape)}")
 
