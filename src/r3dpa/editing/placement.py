@@ -27,7 +27,7 @@ def move_behind(range_m: Tensor, front_m: Tensor) -> Tensor:
     is moved; pixels that are still in front of the box get the range of its near side.
 
     Args:
-        range_m: ``(B, H, W)`` metres, 0 without a return.
+        range_m: ``(B, H, W)`` metres, not above 0 without a return.
         front_m: ``(H, W)`` metres of the near side of the box, 0 outside, see
             :func:`r3dpa.editing.regions.box3d_front_m`.
 
