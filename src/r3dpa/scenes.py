@@ -27,10 +27,10 @@ from r3dpa.geometry import (
     Projection,
     classes_of,
     in_range,
-    in_view,
     labels_of,
     points_of,
     project_pixels,
+    share_outside_view,
     values_at_returns,
     values_in,
     view_limits_deg,
@@ -39,7 +39,7 @@ from r3dpa.geometry import (
 from r3dpa.io import number_of
 
 _PICTURES, _PAGES = 4, 8  # scenes that a notebook cell shows
-_MOST_OUTSIDE = 0.2  # share of the points of a scan that are outside the field of view
+MOST_OUTSIDE_VIEW = 0.2  #: share of the points of a scan of the same sensor
 
 ScanLike = Any
 """A scan: points ``(P, 3)``, or ``(P, 4)`` with the intensity; a range image ``(H, W)`` in metres;
@@ -104,9 +104,8 @@ def scan_pixels(scan: ScanLike, projection: Projection) -> Pixels:
 
 def warn_of_points_outside_view(points: Tensor, projection: Projection) -> None:
     """Warn if more than a fifth of points ``(P, 3)`` lies above or below the field of view."""
-    seen = points[in_range(points, projection.sensor)]
-    outside = 1 - in_view(seen, projection).double().mean().item()
-    if outside > _MOST_OUTSIDE:
+    outside = share_outside_view(points, projection)
+    if outside > MOST_OUTSIDE_VIEW:
         lowest, highest = view_limits_deg(projection)
         warnings.warn(
             f"{outside:.0%} of the points of the scan lie above or below the field of view, "

@@ -113,6 +113,14 @@ class TestFiles:
         assert "before: scan a" in page
         assert "inpaint 1" in page
 
+        # An object is moved into its box, at the step to t = 0.5, and its points there are counted.
+        box = ["--scan", files / "a.bin", "--box3d", 12, 0, -0.5, 4, 4, 3, 0]
+        about = edit(files, "inpaint", tmp_path / "box", *box, *library)
+        assert about["nfe"] == 8 + 1
+        assert len(about["points_inside"]) == 2
+        assert about["points_of_class"] is None  # geometric features know no classes
+        assert edit(files, "inpaint", tmp_path / "anew", *box)["nfe"] == 8
+
         # Without --objects, the library beside the weights.
         beside = files / "geometric.objects"
         with pytest.raises(FileNotFoundError, match=r"no object features .*geometric\.objects"):

@@ -87,6 +87,7 @@ def test_classes_and_a_car_where_the_weights_have_them(tmp_path, monkeypatch):
     edits = [made["scans"][tile["scan"]]["name"] for tile in groups["Edits of seed 0"]]
     assert edits.count("a car 10 m ahead") == 2
     assert [len(draws) for draws in ordered] == [8]
+    assert ordered[0].nfe == 2 * 32 + 12  # and 12 of 16 steps move the car into its box
     assert len(made["categories"]["semantic"]) > 1
     assert {name for _, name, _ in made["categories"]["semantic"]} <= {
         member.name.lower().replace("_", " ") for member in Semantic

@@ -74,7 +74,7 @@ WANDB = logger("WandbLogger", save_dir="", offline=True)
 CSV = logger("CSVLogger", save_dir="", name="")
 
 
-# Comes first: wandb's own process writes its file while the other tests run.
+# Its first test comes early, the test of wandb's file last: wandb's own process takes its time.
 @pytest.fixture(scope="module")
 def fitted(smoke_args, make_once):
     """Run folder of a short fit of vae_alignment as a user starts it, and both its outputs."""
@@ -298,6 +298,15 @@ def test_short_names_of_commands_are_unique():
     assert not set(ALIASES) & set(COMMANDS)
 
 
+def test_a_fit_that_is_refused_leaves_no_configuration_and_no_wandb_run(smoke_args, tmp_path):
+    words = smoke_args("vae_alignment", tmp_path, "--data.init_args.grid_size=[4, 16]")
+    words += [f"--trainer.logger={json.dumps([WANDB])}", "--trainer.callbacks=[]"]
+    with pytest.raises(ValueError, match=r"set --data\.init_args\.grid_size to the latter"):
+        main(words)
+    assert not (tmp_path / "config.yaml").exists()
+    assert not (tmp_path / "wandb").exists()
+
+
 def test_a_fit_logs_its_configuration_to_wandb(fitted):
     run_dir, _, _ = fitted
     (run,) = run_dir.glob("wandb/offline-run-*/run-*.wandb")
@@ -306,12 +315,3 @@ def test_a_fit_logs_its_configuration_to_wandb(fitted):
         assert time.monotonic() < until
         time.sleep(0.1)
     assert b"r3dpa.modules.VAEAlignment" in content
-
-
-def test_a_fit_that_is_refused_leaves_no_configuration_and_no_wandb_run(smoke_args, tmp_path):
-    words = smoke_args("vae_alignment", tmp_path, "--data.init_args.grid_size=[4, 16]")
-    words += [f"--trainer.logger={json.dumps([WANDB])}", "--trainer.callbacks=[]"]
-    with pytest.raises(ValueError, match=r"set --data\.init_args\.grid_size to the latter"):
-        main(words)
-    assert not (tmp_path / "config.yaml").exists()
-    assert not (tmp_path / "wandb").exists()

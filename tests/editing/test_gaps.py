@@ -11,13 +11,12 @@ from r3dpa.data import read_scan
 from r3dpa.editing.gaps import (
     blend_completion,
     check_view,
-    in_view,
     interpolate_gaps,
     median_draw,
     range_error_m,
     unseen_pixels,
 )
-from r3dpa.geometry import LidarSensor, Pixels, SphericalProjection, range_image
+from r3dpa.geometry import LidarSensor, Pixels, SphericalProjection, in_view, range_image
 
 PROJECTION = SphericalProjection(LidarSensor(beams=16, columns=64))
 

@@ -18,6 +18,7 @@ from r3dpa.editing.regions import (
     box3d,
     box3d_front_m,
     dropped_beams,
+    mask_of_tokens,
     sector_weights,
     token_mask,
 )
@@ -124,6 +125,8 @@ class TestInpaint:
         assert ways[1.0].latents.equal(ways[None].latents)
         assert not ways[20.0].latents.equal(ways[None].latents)
         assert ways[20.0].range_m[:, ~MASK].equal(scan[~MASK].expand(2, -1))
+        kept = ~mask_of_tokens(token_mask(MASK, (2, 8)), (2, 8), (4, 16))
+        assert ways[20.0].latents[..., kept].equal(ways[None].latents[..., kept])
         with pytest.raises(ValueError, match=r"near side: must have the shape \(16, 64\)"):
             editor.inpaint(scan, MASK, [0], front_m=torch.ones(8, 64))
 

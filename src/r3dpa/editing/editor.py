@@ -21,62 +21,24 @@ from torch import Tensor
 from r3dpa.checkpoints import Checkpoint
 from r3dpa.editing.gaps import (
     blend_completion,
-    interpolate_gaps,
     median_draw,
     range_error_m,
 )
 from r3dpa.editing.latents import Trajectory, invert, noise_inside_mask, restore_outside_mask, slerp
+from r3dpa.editing.pixel_batches import batch_of, concatenate, interpolated, paste
 from r3dpa.editing.placement import correct_data, is_corrected, move_behind
 from r3dpa.editing.regions import check_mask, mask_of_tokens, token_mask
+from r3dpa.editing.settings import EditSettings
 from r3dpa.flow.guidance import FeatureGuidance, FeatureTarget
 from r3dpa.flow.noise import scene_noise
-from r3dpa.flow.solvers import ODE_SOLVERS, AfterStep, Velocity, evaluations, ode_solver, unchanged
-from r3dpa.flow.times import batch_time, check_interval, ode_times
+from r3dpa.flow.solvers import AfterStep, Velocity, evaluations, ode_solver, unchanged
+from r3dpa.flow.times import batch_time
 from r3dpa.generation import SamplerConfig, SceneGenerator, scene_indices
-from r3dpa.geometry import UNKNOWN_CLASS, Pixels, labels_of
+from r3dpa.geometry import Pixels, labels_of
 from r3dpa.scenes import ScanLike, SceneBatch, map_pixels, scan_pixels
 
 COMPLETION_START = 0.2  #: time of the noise that completions start from
 _COMPLETION_DRAWS = 3  # their median has a smaller error than one draw
-
-
-@dataclass(frozen=True)
-class EditSettings:
-    """Settings of the inversion of latents to noise and back.
-
-    Args:
-        solver: A key of :data:`r3dpa.flow.ODE_SOLVERS`. Midpoint steps have by far the smallest
-            round-trip error per evaluation.
-        steps: Solver steps from noise to data. With ``midpoint`` and `r3dpa-s`, the way to noise
-            and back adds a mean error of 3 cm with 16 steps and 0.4 cm with 32 to the error of the
-            VAE; inpainted cars appear equally often.
-        shift: Finer steps near noise (above 1) or data (below 1).
-        strength: Length of the guidance term relative to the velocity, in [0, 1]; 0 for none.
-        window: First and last guided time; 0 is data, 1 noise.
-    """
-
-    solver: str = "midpoint"
-    steps: int = 16
-    shift: float = 1.0
-    strength: float = 0.5
-    window: tuple[float, float] = (0.0, 1.0)
-
-    def __post_init__(self) -> None:
-        if self.solver not in ODE_SOLVERS:
-            raise ValueError(
-                f"edits need a solver that runs both ways, one of {', '.join(ODE_SOLVERS)}; got "
-                f"{self.solver!r}"
-            )
-        self.times(1.0)
-        if not 0 <= self.strength <= 1:
-            raise ValueError(f"strength must lie in 0..1, got {self.strength:g}; 0.5 is strong")
-        check_interval(self.window, "window")
-
-    def times(self, start: float) -> Tensor:
-        """Times from ``start`` in (0, 1] to the data."""
-        if not 0 < start <= 1:
-            raise ValueError(f"start must be a time above 0 (scan) up to 1 (noise), got {start:g}")
-        return ode_times(self.steps, start, shift=self.shift)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -178,8 +140,8 @@ class SceneEditor:
                 need scans with one in [0, 1].
         """
         if isinstance(scan, Tensor | np.ndarray) and scan.ndim == 3:
-            return self._encode(_concatenate([_batch_of(self.pixels(image)) for image in scan]))
-        return self._encode(_batch_of(self.pixels(scan)))
+            return self._encode(concatenate([batch_of(self.pixels(image)) for image in scan]))
+        return self._encode(batch_of(self.pixels(scan)))
 
     def pixels(self, scan: ScanLike) -> Pixels:
         """Pixels ``(H, W)`` of a scan in the projection of the model, on the CPU."""
@@ -230,7 +192,7 @@ class SceneEditor:
         tokens = token_mask(pixel_mask, self._sit.grid_size, dilation=dilation)
         tokens = tokens.to(self.generator.device)
         edited = mask_of_tokens(tokens, self._sit.grid_size, self._sit.input_size)[None, None]
-        latents = self._encode(_batch_of(pixels))
+        latents = self._encode(batch_of(pixels))
         trajectory = self._inverted(latents, times)
 
         def solve(noise: Tensor) -> tuple[Tensor, FeatureGuidance | None]:
@@ -249,7 +211,7 @@ class SceneEditor:
             return self._solve(velocity, state, times, after_step), guidance
 
         edits, cosine = self._in_batches(indices, seed, solve)
-        pasted = _paste(self._decoded(edits, indices, seed), pixels, pixel_mask)
+        pasted = paste(self._decoded(edits, indices, seed), pixels, pixel_mask)
         errors = self._errors(pixels.range_m[None], latents, trajectory)
         nfe = 2 * self._nfe
         if front_m is not None:
@@ -316,7 +278,7 @@ class SceneEditor:
         if not 0 < start <= 1:
             raise ValueError(f"start must be a time above 0 (scan) up to 1 (noise), got {start:g}")
         pixels = self.pixels(scan)
-        latents = self._encode(_batch_of(_interpolated(pixels, missing)))
+        latents = self._encode(batch_of(interpolated(pixels, missing)))
         path, shape = self.generator.interpolant, self.generator.latent_shape
         completed, means = [], []
         for index in scene_indices(indices):
@@ -327,10 +289,10 @@ class SceneEditor:
             denoised = path.denoise(self._sit.velocity(noisy, time), noisy, time)
             generated = median_draw(self._decoded(denoised))
             range_m = blend_completion(generated.range_m, pixels.range_m, missing)
-            blended = _batch_of(generated._replace(range_m=range_m))
-            completed.append(_paste(blended, pixels, missing))
+            blended = batch_of(generated._replace(range_m=range_m))
+            completed.append(paste(blended, pixels, missing))
             means.append(denoised.mean(dim=0))
-        return self._result(_concatenate(completed), torch.stack(means), _COMPLETION_DRAWS)
+        return self._result(concatenate(completed), torch.stack(means), _COMPLETION_DRAWS)
 
     @torch.no_grad()
     def vary(
@@ -347,7 +309,7 @@ class SceneEditor:
             start: Time of the noise, in (0, 1]; larger values keep less of the scan.
         """
         times, pixels = self.settings.times(start), self.pixels(scan)
-        latents = self._encode(_batch_of(pixels))
+        latents = self._encode(batch_of(pixels))
 
         def solve(noise: Tensor) -> tuple[Tensor, None]:
             time = batch_time(start, noise)
@@ -371,7 +333,7 @@ class SceneEditor:
         if frames < 2:
             raise ValueError(f"frames must be at least 2, the two scans; got {frames}")
         times = self.settings.times(1.0)
-        ends = _concatenate([_batch_of(self.pixels(scan)) for scan in (first, second)])
+        ends = concatenate([batch_of(self.pixels(scan)) for scan in (first, second)])
         latents = self._encode(ends)
         trajectory = self._inverted(latents, times)
         first_noise, second_noise = trajectory.states[0].split(1)
@@ -401,6 +363,8 @@ class SceneEditor:
         def correct(latents: Tensor) -> Tensor:
             pixels = self.generator.decode_pixels(latents)
             moved = pixels._replace(range_m=move_behind(pixels.range_m, near_side_m))
+            if moved.range_m.equal(pixels.range_m):
+                return latents
             # A difference of two encodings, in which the error of the VAE does not count.
             return latents + (self._encode(moved) - self._encode(pixels))
 
@@ -491,7 +455,7 @@ class SceneEditor:
             batch_numbers = None if numbers is None else numbers[batch]
             pixels = self.generator.decode_pixels(latents[batch], batch_numbers, seed)
             parts.append(map_pixels(Tensor.cpu, pixels))
-        return _concatenate(parts)
+        return concatenate(parts)
 
     def _errors(
         self, range_m: Tensor, latents: Tensor, trajectory: Trajectory | None = None
@@ -503,43 +467,3 @@ class SceneEditor:
             return error, None
         back = self._solve(self._sit.velocity, trajectory.states[0], trajectory.times)
         return error, range_error_m(self._decoded(back).range_m, reconstructed)
-
-
-def _batch_of(pixels: Pixels) -> Pixels:
-    return map_pixels(lambda values: values[None], pixels)
-
-
-def _concatenate(parts: Sequence[Pixels]) -> Pixels:
-    """Pixels of several batches; values missing in one batch are dropped."""
-    intensities = [part.intensity for part in parts if part.intensity is not None]
-    classes = [part.classes for part in parts if part.classes is not None]
-    return Pixels(
-        torch.cat([part.range_m for part in parts]),
-        torch.cat(intensities) if len(intensities) == len(parts) else None,
-        torch.cat(classes) if len(classes) == len(parts) else None,
-    )
-
-
-def _interpolated(pixels: Pixels, missing: Tensor) -> Pixels:
-    """Pixels with interpolated ranges, and with the nearest intensities and classes."""
-    range_m = interpolate_gaps(pixels.range_m, missing)
-    intensity, classes = (
-        None if values is None else interpolate_gaps(values.float(), missing, "nearest")
-        for values in (pixels.intensity, pixels.classes)
-    )
-    return Pixels(range_m, intensity, None if classes is None else classes.long())
-
-
-def _paste(decoded: Pixels, scan: Pixels, mask: Tensor) -> Pixels:
-    """Decoded pixels ``(B, H, W)`` inside a mask ``(H, W)``, pixels of the scan outside."""
-    range_m = torch.where(mask, decoded.range_m, scan.range_m)
-    intensity, classes = decoded.intensity, decoded.classes
-    if intensity is not None:
-        intensity = torch.where(range_m > 0, intensity, 0.0)
-        if scan.intensity is not None:
-            intensity = torch.where(mask, intensity, scan.intensity)
-    if classes is not None:
-        outside = torch.full_like(mask, UNKNOWN_CLASS, dtype=torch.long)
-        classes = torch.where(range_m > 0, classes, UNKNOWN_CLASS)
-        classes = torch.where(mask, classes, outside if scan.classes is None else scan.classes)
-    return Pixels(range_m, intensity, classes)

@@ -15,18 +15,18 @@ from r3dpa.geometry import (
     Pixels,
     Projection,
     in_range,
-    in_view,
+    share_outside_view,
     view_limits_deg,
 )
 from r3dpa.geometry.sensor import angles_of
+from r3dpa.scenes import MOST_OUTSIDE_VIEW
 
 Interpolation = Literal["inverse", "linear", "nearest"]
 # Shares of the field of view that a scan of the same sensor fills.
 _LEAST_ROWS, _LEAST_COLUMNS = 0.5, 0.75
 # Share of the returns with one right below: 0.76 or more of all beams, 0.52 of half of them.
 _LEAST_DENSE = 0.6
-# Share of the points beyond the field of view, of scans of the same and of another sensor.
-_MOST_OUTSIDE, _MOST_OUTSIDE_OF_ANOTHER = 0.2, 0.6
+_MOST_OUTSIDE_OF_ANOTHER = 0.6  # as MOST_OUTSIDE_VIEW, of scans of another sensor
 _WIDEST_GAP_ROWS = 8  # between two beams of a sensor that has fewer
 _ONE_SURFACE = 1.3  # ratio of ranges up to which two beams are taken to meet one surface
 
@@ -51,10 +51,9 @@ def check_view(
     sensor = projection.sensor
     lowest, highest = view_limits_deg(projection)
     view = f"{lowest:.1f} to {highest:.1f} degrees above the horizon"
-    seen = points[in_range(points, sensor)]
-    outside = 1 - in_view(seen, projection).double().mean().item()
-    if outside > (_MOST_OUTSIDE if missing is None else _MOST_OUTSIDE_OF_ANOTHER):
-        inclination = angles_of(seen)[0].rad2deg()
+    outside = share_outside_view(points, projection)
+    if outside > (MOST_OUTSIDE_VIEW if missing is None else _MOST_OUTSIDE_OF_ANOTHER):
+        inclination = angles_of(points[in_range(points, sensor)])[0].rad2deg()
         low, high = inclination.quantile(torch.tensor([0.01, 0.99]).double()).tolist()
         raise ValueError(
             f"{outside:.0%} of the points lie outside the field of view of the checkpoint, {view}: "

@@ -96,16 +96,23 @@ class ObjectLibrary:
         Raises:
             ValueError: If the library lacks the class; the message lists the classes that it has.
         """
+        return self.features[self.names.index(self._class_name(name))]
+
+    def semantic_class(self, name: str) -> int:
+        """Place of a class of the library in :data:`r3dpa.geometry.SEMANTIC_CLASSES`.
+
+        Raises:
+            ValueError: As :meth:`feature`.
+        """
+        name = self._class_name(name)
+        labels = {each: label for label, each in CLASS_NAMES.items()}
+        return int(classes_of(torch.tensor(labels[name])))
+
+    def _class_name(self, name: str) -> str:
         name = _OTHER_NAMES.get(name, name)
         if name not in self.names:
             raise ValueError(f"unknown class {name!r}; choose from {', '.join(self.names)}")
-        return self.features[self.names.index(name)]
-
-    def semantic_class(self, name: str) -> int:
-        """Place of a class of the library in :data:`r3dpa.geometry.SEMANTIC_CLASSES`."""
-        name = _OTHER_NAMES.get(name, name)
-        labels = {each: label for label, each in CLASS_NAMES.items()}
-        return int(classes_of(torch.tensor(labels[name])))
+        return name
 
     def check_source(self, source: str | None, dim: int) -> None:
         """Refuse a network that was aligned with another source or width.

@@ -14,7 +14,7 @@ from r3dpa.flow.interpolant import Interpolant
 from r3dpa.flow.solvers import AfterStep, Velocity
 from r3dpa.flow.times import batch_time, per_sample
 
-_MARGIN_M = 0.2
+_MARGIN_M = 0.2  # what is this little in front of the box counts as in it
 # Share of the pixels in front of the box that end at its near side or behind it.
 _MOVED_SHARE = 0.8
 _FIRST_TIME, _LAST_TIME = 0.95, 0.2

@@ -137,6 +137,12 @@ def in_view(points: Tensor, projection: Projection) -> Tensor:
     return (inclination >= lowest - _MARGIN_DEG) & (inclination <= highest + _MARGIN_DEG)
 
 
+def share_outside_view(points: Tensor, projection: Projection) -> float:
+    """Share of the points ``(P, 3)`` within range that lie above or below the field of view."""
+    seen = points[in_range(points, projection.sensor)]
+    return 1 - in_view(seen, projection).double().mean().item()
+
+
 def range_image(
     points: Tensor, projection: Projection, values: Tensor | None = None
 ) -> tuple[Tensor, Tensor | None]:
