@@ -130,6 +130,20 @@ class TestInpaint:
         with pytest.raises(ValueError, match=r"near side: must have the shape \(16, 64\)"):
             editor.inpaint(scan, MASK, [0], front_m=torch.ones(8, 64))
 
+    def test_steps_start_from_the_scan_outside_the_mask_after_a_correction(self, generator, scan):
+        """Five Euler steps there, and five back, of which four are corrected at one evaluation."""
+        kept = ~mask_of_tokens(token_mask(MASK, (2, 8)), (2, 8), (4, 16))
+        outside, real = [], generator.sit.velocity
+        generator.sit.velocity = lambda x, time: outside.append(x[..., kept]) or real(x, time)
+        try:
+            editor = SceneEditor(generator, EditSettings("euler", 5))
+            editor.inpaint(scan, MASK, [0], front_m=torch.where(MASK, 20.0, 0.0))
+        finally:
+            del generator.sit.velocity
+        there, back = outside[1:5], outside[6:14]
+        for inverted, after_correction in zip(reversed(there), back[1::2], strict=True):
+            assert after_correction.equal(inverted)
+
     def test_corrected_steps_count_as_evaluations(self, generator, scan):
         """Steps to .8, .6, .4 and .2 of five; the last one ends at 0."""
         editor = SceneEditor(generator, EditSettings("euler", 5))
