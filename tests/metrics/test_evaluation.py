@@ -18,7 +18,7 @@ from r3dpa.metrics.scene import DEFAULT, EvaluationScene, through_sensor
 from r3dpa.metrics.scene_features import SceneFeatures
 
 SENSOR = LidarSensor(beams=16, columns=64)
-PROTOCOL = replace(DEFAULT, sensor=SENSOR, voxel_m=1.0, num_samples=60)
+PROTOCOL = replace(DEFAULT, sensor=SENSOR, voxel_m=2.0, num_samples=60)
 CARD = {"backbone": "toy", "layer": "all", "weights": "abc", "preprocessing": "none"}
 QUICK = Resampling(num_resamples=40)
 DISTANCES = {"JSD", "TV", "W1 range", "MMD", "CD 3D", "TOY", "TOY inf", "TOY KID"}
