@@ -5,7 +5,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from r3dpa.bench.dry_run import batch_lines
+from r3dpa.bench.dry_run import DryRun, batch_lines
+from r3dpa.bench.training import StageCost
 from r3dpa.cli import main
 
 
@@ -30,8 +31,8 @@ def test_a_dry_run_measures_a_step_and_writes_nothing(smoke_args, tmp_path, caps
 
 def test_a_dry_run_of_checkpoints(smoke_args, tmp_path, vae_checkpoint, capsys):
     """Beside the weights of a checkpoint lie both moments of those that are trained."""
-    words = smoke_args("vae_alignment", tmp_path / "run")
-    main([*words, "--dry_run"])
+    words = smoke_args("vae_alignment", tmp_path / "run", "--trainer.max_steps=-1")
+    main([*words, "--dry_run"])  # which measures no step without a limit
     (line,) = (x for x in capsys.readouterr().out.splitlines() if "checkpoints of" in x)
     megabytes = float(line.partition("2 checkpoints of ")[2].split()[0])
     assert megabytes == pytest.approx(vae_checkpoint.stat().st_size / 1e6, rel=0.05)
@@ -58,6 +59,8 @@ def test_a_processor_without_bfloat16_trains_in_float32(
 ):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: instructions)
+    cost = StageCost("vae_alignment", step_seconds=[1.0])  # the steps are measured in other tests
+    monkeypatch.setattr(DryRun, "_measure", lambda *_: cost)
     words = smoke_args("vae_alignment", tmp_path / "run", "--trainer.precision=bf16-mixed")
     lines = dry_run([*words, f"--trainer.accelerator={accelerator}"], capsys)
     assert f"thread, {precision}" in lines["measured"].replace("threads", "thread")
