@@ -134,7 +134,7 @@ def trained_once(smoke_args, make_once):
 @pytest.fixture(scope="session")
 def vae_checkpoint(trained_once) -> Path:
     """Checkpoint of the VAE-alignment stage at smoke size, trained for three steps."""
-    return trained_once("vae_alignment")
+    return trained_once("vae_alignment", "--trainer.limit_val_batches=0", "--trainer.callbacks=[]")
 
 
 @pytest.fixture(scope="session")

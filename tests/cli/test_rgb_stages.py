@@ -98,6 +98,7 @@ def test_vae_alignment_starts_from_an_rgb_model(rgb, smoke_args, tmp_path, caplo
     """With the blocks, on another grid; the projector is fresh."""
     more = ["--model.init_args.optimizer.lr=0", "--model.init_args.keep_projector=false"]
     more += [f"--model.init_args.rgb_weights={rgb}", "--trainer.logger=false"]
+    more += ["--trainer.limit_val_batches=0", "--trainer.callbacks=[]"]
     main(smoke_args("vae_alignment", tmp_path, *more))
     state = torch.load(tmp_path / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
     source = read_checkpoint(rgb).network("sit").state_dict

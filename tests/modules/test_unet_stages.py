@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 import yaml
+from stage_runs import QUICK
 from tiny_stages import QUIET, stage_module, train
 from tiny_unet import SIZES, tiny_unet
 
@@ -52,10 +53,10 @@ def unet_file(tmp_path_factory):
 @pytest.fixture(scope="module")
 def joint_checkpoint(smoke_args, unet_file, tmp_path_factory):
     run_dir = tmp_path_factory.mktemp("unet_joint")
-    more = ["--model.init_args.sit", str(unet_file), "--trainer.logger=false"]
+    more = ["--model.init_args.sit", str(unet_file)]
     # Of an untrained network the output is 0, and so is that of its average.
     more += ["--model.init_args.ema_decay", "0", "--model.init_args.optimizer.lr", "0.01"]
-    main(smoke_args("joint", run_dir, *more))
+    main(smoke_args("joint", run_dir, *more, *QUICK))
     return run_dir / "checkpoints" / "last.ckpt"
 
 
