@@ -6,6 +6,7 @@ shell, without the seconds of the imports. Signals, limits and full disks are re
 
 from __future__ import annotations
 
+import atexit
 import functools
 import json
 import multiprocessing
@@ -80,7 +81,10 @@ def _run(log: Path, words: list[str], faults: tuple[Callable[[], None], ...]) ->
         fault()
     from r3dpa.cli import main
 
-    main()
+    try:
+        main()
+    finally:
+        atexit._run_exitfuncs()  # as at the end of any process but those of multiprocessing
 
 
 @dataclass(frozen=True)
@@ -106,6 +110,12 @@ class At:
             return original(*args, **kwargs)
 
         setattr(holder, name, patched)
+
+
+def write_stdout(path: Path) -> None:
+    """Standard output goes into a file of its own."""
+    with path.open("w") as file:
+        os.dup2(file.fileno(), 1)
 
 
 def kill_worker() -> None:

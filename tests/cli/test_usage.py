@@ -5,9 +5,11 @@ import shutil
 import subprocess
 import sys
 import time
+from functools import partial
 
 import pytest
 import yaml
+from fault_commands import Command, write_stdout
 
 from r3dpa.cli import ALIASES, COMMANDS, OWN_PARSER, main
 from r3dpa.cli.class_arguments import class_arguments
@@ -83,9 +85,9 @@ def fitted(smoke_args, make_once):
         words = smoke_args("vae_alignment", folder / "run", "--trainer.enable_progress_bar=true")
         words += [f"--trainer.logger={json.dumps([WANDB, CSV])}", "--trainer.callbacks=[]"]
         folder.mkdir()
-        with (folder / "stdout").open("w") as out, (folder / "stderr").open("w") as errors:
-            command = [sys.executable, "-m", "r3dpa", *words]
-            subprocess.run(command, stdout=out, stderr=errors, timeout=400, check=True)
+        command = Command(folder / "stderr", words, partial(write_stdout, folder / "stdout"))
+        status, seen = command.end()
+        assert status == 0, seen
 
     folder = make_once("fitted", fit)
     stdout, stderr = ((folder / name).read_text() for name in ("stdout", "stderr"))
