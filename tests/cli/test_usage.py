@@ -1,5 +1,7 @@
 """What a user types: mistakes answered at once, suggestions, help, completion, lines of a fit."""
 
+import contextlib
+import io
 import json
 import shutil
 import subprocess
@@ -273,6 +275,15 @@ def test_common_names_of_options():
     assert [config.scans for config in arguments] == [7, 7]
 
 
+@pytest.fixture(scope="module")
+def completion():
+    """Script that completes commands in bash."""
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        main(["completion", "bash"])
+    return printed.getvalue()
+
+
 @pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
 @pytest.mark.parametrize(
     ("typed", "completed"),
@@ -286,11 +297,10 @@ def test_common_names_of_options():
         (["data", "view", "--nu"], ["--num"]),
     ],
 )
-def test_completion(typed, completed, capsys):
-    main(["completion", "bash"])
-    script = capsys.readouterr().out
+def test_completion(typed, completed, completion):
     words = " ".join(repr(word) for word in ["r3dpa", *typed])
-    script += f"\nCOMP_WORDS=({words}); COMP_CWORD={len(typed)}; _r3dpa; echo ${{COMPREPLY[@]}}"
+    call = f"COMP_WORDS=({words}); COMP_CWORD={len(typed)}; _r3dpa; echo ${{COMPREPLY[@]}}"
+    script = f"{completion}\n{call}"
     done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.split() == completed
 
