@@ -66,6 +66,15 @@ def test_a_processor_without_bfloat16_trains_in_float32(
     assert f"thread, {precision}" in lines["measured"].replace("threads", "thread")
 
 
+def test_a_baseline_keeps_no_snapshots(tmp_path, capsys):
+    """Though the callback that keeps them is in the common trainer."""
+    words = ["fit", "r2dm", "--preset", "demo", "--run_dir", str(tmp_path / "run")]
+    main([*words, "--trainer.max_steps=-1", "--dry_run"])
+    printed = capsys.readouterr().out
+    assert "checkpoints of" in printed
+    assert "snapshots" not in printed
+
+
 @pytest.mark.parametrize(
     ("processes", "batch_size", "warning"),
     [
