@@ -246,7 +246,8 @@ r3dpa-s-scores: $(READY) ## measure the weights of the package: hours of a core 
 	$(MEASURE)/r3dpa data prepare --config conf/r3dpa_s_2/data.yaml
 	$(MEASURE)/r3dpa sample --num $(SCENES) --batch_size 8 --formats '[]' --out $(SCORES)/r3dpa-s
 	test -e $(SCORES)/reference.safetensors || $(MEASURE)/r3dpa data reference \
-		--data conf/r3dpa_s_2/data.yaml --split val --out $(SCORES)/reference.safetensors
+		--data conf/r3dpa_s_2/data.yaml --split val --spaces fwid,fwid_judge,fgeo \
+		--out $(SCORES)/reference.safetensors
 	$(MEASURE)/r3dpa evaluate --samples $(SCORES)/r3dpa-s --reference $(SCORES)/reference.safetensors \
 		--label r3dpa-s --out $(SCORES)/evaluation
 	cp $(SCORES)/evaluation/evaluation.json $(KEPT)/evaluation.json

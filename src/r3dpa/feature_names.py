@@ -28,5 +28,7 @@ FeatureSpace = Literal[
 ]
 SPACES: tuple[FeatureSpace, ...] = get_args(FeatureSpace)
 """All spaces, in the order of tables."""
-FREE_SPACES: tuple[FeatureSpace, ...] = ("fwid", "fgeo")
+FREE_SPACES: tuple[FeatureSpace, ...] = ("fwid", "fwid_judge", "fgeo")
 """Spaces that need no weights from elsewhere."""
+DEFAULT_SPACES: tuple[FeatureSpace, ...] = ("fwid", "fgeo")
+"""Spaces that a comparison has unless others are named."""

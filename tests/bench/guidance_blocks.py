@@ -2,7 +2,7 @@
 
     python tests/bench/guidance_blocks.py --ckpt runs/r3dpa_s_2/joint/checkpoints/last.ckpt \
         --reference runs/r3dpa_s_2/reference.safetensors --blocks 3 4 5 6 --scales 1.5 2 \
-        --judge runs/judge/waffleiron_s.safetensors --num 200 --out blocks.json
+        --num 200 --out blocks.json
 
 Perturbed-attention guidance, the same noise for all, beside no guidance. What wins is recorded by
 ``guidance`` of the YAML of the next stage (conf/r3dpa_s_2/few_step.yaml), whose checkpoint
@@ -39,7 +39,6 @@ def main(arguments=None):
     parser.add_argument(
         "--reference", type=Path, required=True, help="file of r3dpa data reference"
     )
-    parser.add_argument("--judge", type=Path, help="weights of FWID_JUDGE")
     parser.add_argument("--blocks", type=int, nargs="+", required=True)
     parser.add_argument("--scales", type=float, nargs="+", default=[1.5])
     parser.add_argument("--steps", type=int, default=8)
@@ -47,8 +46,7 @@ def main(arguments=None):
     parser.add_argument("--out", type=Path, help="JSON file to write")
     options = parser.parse_args(arguments)
     reference = load_reference(options.reference)
-    weights = {} if options.judge is None else {"fwid_judge": options.judge}
-    spaces = reference_spaces(reference, None, weights, "cpu")
+    spaces = reference_spaces(reference, None, None, "cpu")
     plain = SceneGenerator.from_checkpoint(
         options.ckpt, SamplerConfig("ab3", options.steps, shift=2.5), device="cpu", guidance_scale=1
     )

@@ -4,6 +4,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from r3dpa.feature_names import DEFAULT_SPACES, FREE_SPACES, SOURCES
 from r3dpa.features import GeometricFeatures, WaffleIronS
 from r3dpa.geometry import LidarSensor, unproject
 from r3dpa.metrics.networks.liploc import LIPLoc
@@ -203,6 +204,22 @@ def test_point_net_space_reads_empty_pixels_as_the_origin(tmp_path):
     torch.testing.assert_close(space([scene]), network(points.T[None]), **FLOAT32)
 
 
+def test_the_second_judge_comes_with_the_package():
+    """It is a network of its own, as FWID's, and takes part in no default comparison."""
+    judges = {name: scene_features(name) for name in ("fwid", "fwid_judge")}
+    assert [space.card["backbone"] for space in judges.values()] == [
+        "waffleiron-s",
+        "waffleiron-judge",
+    ]
+    assert judges["fwid"].card["weights"] != judges["fwid_judge"].card["weights"]
+    features = judges["fwid_judge"](seen(2))
+    assert features.shape == (2, 96)
+    assert not torch.equal(features[0], features[1])
+    assert "fwid_judge" in FREE_SPACES
+    assert "fwid_judge" not in DEFAULT_SPACES
+    assert "waffleiron-judge" not in SOURCES
+
+
 def test_official_files_become_spaces(tmp_path):
     torch.manual_seed(0)
     networks = {"fsvd": MinkowskiNet(WIDTHS), "fpvd": SPVCNN(WIDTHS)}
@@ -229,7 +246,6 @@ def test_official_files_become_spaces(tmp_path):
     [
         ("fid", None, "unknown feature space 'fid'; choose from frid, fld"),
         ("frid", None, r"frid needs weights: give --ckpt\.frid FILE"),
-        ("fwid_judge", None, r"--ckpt\.fwid_judge FILE .*waffleiron_judge\.yaml"),
         ("fgeo", "x.ckpt", "fgeo has no weights: leave x.ckpt out"),
         ("fld", "x.ckpt", "x.ckpt: no such file"),
     ],

@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 from r3dpa.data import Scan
 from r3dpa.data.datamodules import LidarDataModule
-from r3dpa.feature_names import FREE_SPACES
+from r3dpa.feature_names import DEFAULT_SPACES
 from r3dpa.generation import SamplerConfig
 from r3dpa.geometry import points_of
 from r3dpa.io import atomic_path, source_commit
@@ -61,7 +61,7 @@ class SceneScorer(L.Callback):
             it, all scans of the data module are the reference, training and held-out; their
             statistics are computed once and kept in ``<run_dir>/evaluation/reference.safetensors``.
         split: Split of ``data_statistics.npy``; default: ``val``, if it holds both.
-        spaces: Feature spaces; default: all that need no file or have one in ``ckpt``.
+        spaces: Feature spaces; default: ``fwid``, ``fgeo``, and all with a file in ``ckpt``.
         ckpt: Official weights by space.
         protocol: ``default`` or ``published``; default: as recorded in the reference file, else
             ``default``.
@@ -115,7 +115,7 @@ class SceneScorer(L.Callback):
                 )
             scans = datamodule.all_set.scans
             setting = replace(PROTOCOLS[self.protocol or "default"], sensor=datamodule.sensor)
-            names = (*FREE_SPACES, *(name for name in self.ckpt if name not in FREE_SPACES))
+            names = tuple(dict.fromkeys((*DEFAULT_SPACES, *self.ckpt)))
             spaces = feature_spaces(self.spaces or names, self.ckpt, setting, device)
             about = {
                 "data": str(datamodule.scans),

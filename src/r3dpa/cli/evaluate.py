@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from jsonargparse.typing import PositiveInt
 
-from r3dpa.feature_names import FeatureSpace
+from r3dpa.feature_names import DEFAULT_SPACES, FeatureSpace
 from r3dpa.io import check_file, check_folder
 
 
@@ -19,7 +19,7 @@ def reference(
     *,
     data: Path,
     out: Path,
-    spaces: tuple[FeatureSpace, ...] = ("fwid", "fgeo"),
+    spaces: tuple[FeatureSpace, ...] = DEFAULT_SPACES,
     ckpt: dict[str, Path] | None = None,
     split: Literal["train", "val", "all"] = "all",
     limit: PositiveInt | None = None,
@@ -34,9 +34,9 @@ def reference(
     Args:
         data: Folder of scans, in the KITTI-360 layout or any other, or a data YAML.
         out: File to write, ``.safetensors``.
-        spaces: Feature spaces: ``fwid`` and ``fgeo`` need no file; ``frid``, ``fld``, ``fsvd`` and
-            ``fpvd``, and ``frd``, ``frid_r2flow``, ``frid_lidm`` and ``fpd`` of the baselines, need
-            the weights of the official networks; ``fwid_judge`` needs a WaffleIron of yours.
+        spaces: Feature spaces: ``fwid``, ``fwid_judge`` and ``fgeo`` need no file; ``frid``,
+            ``fld``, ``fsvd`` and ``fpvd``, and ``frd``, ``frid_r2flow``, ``frid_lidm`` and ``fpd``
+            of the baselines, need the weights of the official networks.
         ckpt: Weights by space, such as ``--ckpt.frid model.ckpt``.
         split: Part of the data.
         limit: Maximum scans, evenly spaced.

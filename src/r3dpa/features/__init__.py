@@ -3,7 +3,13 @@
 from r3dpa.feature_names import SOURCES
 from r3dpa.features.dinov2 import DINOv2
 from r3dpa.features.geometric import GeometricFeatures
-from r3dpa.features.scalr import ScaLR, WaffleIronS, WaffleIronS2, feature_source
+from r3dpa.features.scalr import (
+    ScaLR,
+    WaffleIronJudge,
+    WaffleIronS,
+    WaffleIronS2,
+    feature_source,
+)
 from r3dpa.features.voxels import (
     Masking,
     PointCloudBatch,
@@ -22,6 +28,7 @@ __all__ = [
     "ScaLR",
     "ScanGrid",
     "WaffleIron",
+    "WaffleIronJudge",
     "WaffleIronS",
     "WaffleIronS2",
     "collate_scans",

@@ -241,6 +241,16 @@ class WaffleIronS2(WaffleIronS):
     shipped = _FOLDER / "waffleiron_s_2.safetensors"
 
 
+class WaffleIronJudge(WaffleIronS):
+    """``waffleiron-judge``: the network behind FWID_JUDGE, which teaches no generator.
+
+    Of another shape than ``waffleiron-s``, and trained on other streets.
+    """
+
+    name = "waffleiron-judge"
+    shipped = _FOLDER / "waffleiron_judge.safetensors"
+
+
 def save_weights(
     path: Path,
     network: WaffleIron,

@@ -12,12 +12,12 @@ name             features                                 width  weights
 ``frid_lidm``    the same without standardised input      512    official file
 ``fpd``          last four layers of PointNet (R2DM)      1808   official file
 ``fwid``         tokens of ``waffleiron-s``, over points  128    in the package
-``fwid_judge``   the same of another WaffleIron           any    file of your own
+``fwid_judge``   the same of ``waffleiron-judge``         96     in the package
 ``fgeo``         ``geometric``, mean over points          64     needs none
 ===============  =======================================  =====  ===============
 
-Distances in the last three have no published numbers. ``fwid_judge`` is for a network that taught
-no generator, such as the one of ``conf/experiment/waffleiron_judge.yaml``, beside ``fwid``.
+Distances in the last three have no published numbers. ``fwid`` and ``fwid_judge`` take the weights
+of another WaffleIron too, as ``conf/experiment/waffleiron_judge.yaml`` writes them.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from r3dpa.feature_names import FREE_SPACES, SPACES
-from r3dpa.features import GeometricFeatures, WaffleIronS
+from r3dpa.features import GeometricFeatures, WaffleIronJudge, WaffleIronS
 from r3dpa.features.geometric import CENTRES
 from r3dpa.features.scalr import sha256
 from r3dpa.geometry import unproject
@@ -97,16 +97,11 @@ def scene_features(
     if name in FREE_SPACES:
         return point_extractor_space(name, None if ckpt is None else Path(ckpt), device)
     if ckpt is None:
-        origin = "the model.ckpt of the release"
-        if name == "fwid_judge":
-            origin = "as conf/experiment/waffleiron_judge.yaml writes it"
         raise ValueError(
             f"{name} needs weights: give --ckpt.{name} FILE (`r3dpa test`: --scorer.ckpt.{name} "
-            f"FILE), {origin}; without a file there are "
-            f"{' and '.join(FREE_SPACES)}"
+            f"FILE), the model.ckpt of the release; without a file there are "
+            f"{', '.join(FREE_SPACES)}"
         )
-    if name == "fwid_judge":
-        return point_extractor_space(name, Path(ckpt), device)
     if name == "frid":
         return range_vit_space(RangeViT.from_checkpoint(ckpt, protocol.sensor).to(device))
     if name == "fld":
@@ -236,8 +231,13 @@ def voxel_space(network: MinkowskiNet, protocol: Protocol) -> SceneFeatures:
 
 
 def point_extractor_space(name: str, ckpt: Path | None, device: str) -> SceneFeatures:
-    """FWID's and FGEO's features: means over points, without the lift to a higher dimension."""
-    extractor: Any = (GeometricFeatures() if name == "fgeo" else WaffleIronS(ckpt)).to(device)
+    """Features of FWID, FWID_JUDGE and FGEO: means over points, not lifted to more dimensions."""
+    extractor: Any
+    if name == "fgeo":
+        extractor = GeometricFeatures()
+    else:
+        extractor = (WaffleIronJudge if name == "fwid_judge" else WaffleIronS)(ckpt)
+    extractor.to(device)
     if name != "fgeo":
         dim, layer = extractor.network.width, "normalised tokens, mean over points"
     else:
