@@ -128,12 +128,11 @@ class DryRun:
         if saver.save_top_k < 0 < trainer.max_steps:
             count = math.ceil(trainer.max_steps / saver.every_n_train_steps)
         parts = [f"{count} checkpoints of {_size(size)}, {_size(count * size)}"]
-        module = self.module
+        ema = self.module.ema if isinstance(self.module, GenerativeModule) else None
         for callback in trainer.callbacks:
-            keeps = isinstance(module, GenerativeModule) and module.ema is not None
-            if isinstance(callback, EMASnapshots) and keeps:
+            if isinstance(callback, EMASnapshots) and ema is not None:
                 count = len(callback.fractions if callback.steps is None else callback.steps)
-                size = sum(tensor.nbytes for tensor in module.ema.sit.state_dict().values())
+                size = sum(tensor.nbytes for tensor in ema.sit.state_dict().values())
                 parts += [f"{count} snapshots of {_size(size)}, {_size(count * size)}"]
         return parts
 
