@@ -118,6 +118,11 @@ def write_stdout(path: Path) -> None:
         os.dup2(file.fileno(), 1)
 
 
+def leave_wandb_of_parent() -> None:
+    """Start a service of wandb for this process alone, which has written all when it ends."""
+    os.environ.pop("WANDB_SERVICE", None)
+
+
 def kill_worker() -> None:
     """One of the processes that work for this one is killed."""
     os.kill(multiprocessing.active_children()[0].pid, signal.SIGKILL)
