@@ -224,6 +224,22 @@ class StageCLI(LightningCLI):
             "run_dir", "checkpoint.dirpath", compute_fn=lambda run_dir: f"{run_dir}/checkpoints"
         )
 
+    def _dump_config(self) -> None:
+        """Keep the configuration for the hyperparameters of model and data.
+
+        As Lightning does, but without checking once more what the parser has accepted: that took a
+        tenth of a second.
+        """
+        if not hasattr(self, "config_dump"):
+            text = self.parser.dump(
+                self.config,
+                format="yaml",
+                skip_unset=False,
+                skip_validation=True,
+                skip_link_targets=False,
+            )
+            self.config_dump = yaml.safe_load(text)[self.config.subcommand]
+
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
         """Show losses in the bar; record the configuration before other callbacks start."""
         trainer: Any = super().instantiate_trainer(**kwargs)
