@@ -227,8 +227,8 @@ class StageCLI(LightningCLI):
     def _dump_config(self) -> None:
         """Keep the configuration for the hyperparameters of model and data.
 
-        As Lightning does, but without checking once more what the parser has accepted: that took a
-        tenth of a second.
+        As Lightning does, but without checking once more what the parser has accepted, a tenth of a
+        second, and without an option that jsonargparse 5 removes.
         """
         if not hasattr(self, "config_dump"):
             text = self.parser.dump(
