@@ -235,13 +235,11 @@ def point_extractor_space(name: str, ckpt: Path | None, device: str) -> SceneFea
     extractor: Any
     if name == "fgeo":
         extractor = GeometricFeatures()
+        dim, layer = extractor.basis.shape[1], "kernel features, mean over points"
     else:
         extractor = (WaffleIronJudge if name == "fwid_judge" else WaffleIronS)(ckpt)
-    extractor.to(device)
-    if name != "fgeo":
         dim, layer = extractor.network.width, "normalised tokens, mean over points"
-    else:
-        dim, layer = extractor.basis.shape[1], "kernel features, mean over points"
+    extractor.to(device)
 
     def extract(scenes: Sequence[EvaluationScene]) -> Tensor:
         clouds = [F.pad(_points(scene), (0, 1), value=_INTENSITY) for scene in scenes]
