@@ -61,7 +61,7 @@ class SceneScorer(L.Callback):
             it, all scans of the data module are the reference, training and held-out; their
             statistics are computed once and kept in ``<run_dir>/evaluation/reference.safetensors``.
         split: Split of ``data_statistics.npy``; default: ``val``, if it holds both.
-        spaces: Feature spaces; default: those of the reference file that need no weights or have
+        spaces: Feature spaces; default: all of the reference file that need no weights or have
             them in ``ckpt``; without a reference file ``fwid``, ``fgeo`` and those in ``ckpt``.
         ckpt: Official weights by space.
         protocol: ``default`` or ``published``; default: as recorded in the reference file, else
