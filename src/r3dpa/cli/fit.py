@@ -59,11 +59,13 @@ _FEATURE_OPTIONS = (
     "out",
     "trainer",
 )
+_PREPARE_OPTIONS = ("help", "config", "print_config", "data")
 _CHECKPOINT_OPTIONS = (
     "--ckpt_path",
     "--model.init_args.init_from",
     "--model.init_args.rgb_weights",
 )
+_YAML = (".yaml", ".yml")
 _CLASS_KEYS = ("init_args", "dict_kwargs", "help")  # beside arguments of a class
 _CHECKPOINT_WORDS = ("last", "best", "hpc", "null")  # of --ckpt_path, beside files
 
@@ -100,18 +102,25 @@ def features(args: list[str]) -> None:
         ValueError: If the data do not exist, or the feature source is unknown.
     """
     for option, value in _options(args[1:]):
-        if option == "--data" and "/" in value and not Path(value).exists():
+        is_path = "/" in value or value.endswith(_YAML)
+        if option == "--data" and is_path and not shipped(value).exists():
             raise ValueError(f"--data {value}: no such folder of scans or data YAML")
         if option == "--extractor":
             check_known("feature source", value, SOURCES)
         _check_option("data features", option, _FEATURE_OPTIONS)
+        _check_config("data features", option, value)
     from r3dpa.cli.features import features as write_features
 
     write_features(args)
 
 
 def prepare(args: list[str]) -> None:
-    """Run ``data prepare``, given its name and the words after it."""
+    """Run ``data prepare``, given its name and the words after it, and refuse simple mistakes."""
+    words = args[1:]
+    for option, value in _options(words):
+        _check_option("data prepare", option, _PREPARE_OPTIONS)
+        _check_config("data prepare", option, value)
+    check_class_arguments("data prepare", words)
     from r3dpa.cli.features import prepare as prepare_data
 
     prepare_data(args)
@@ -161,6 +170,12 @@ def _check_option(command: str, option: str, known: tuple[str, ...]) -> None:
     _check_trainer_option(command, option)
 
 
+def _check_config(command: str, option: str, value: str) -> None:
+    """Refuse a YAML file that does not exist."""
+    if option == "--config" and value.endswith(_YAML) and not shipped(value).exists():
+        _refuse(command, f"--config: no file {value}")
+
+
 def _check_trainer_option(command: str, option: str) -> None:
     """Refuse an option that names no argument of the trainer."""
     group, _, keys = option.partition(".")
@@ -181,7 +196,7 @@ def check_class_arguments(command: str, words: list[str]) -> None:
     for option, value in _options(words):
         group, _, keys = option[2:].partition(".")
         name = keys.removeprefix("init_args.").partition(".")[0].rstrip("+")
-        if option == "--config" and value.endswith((".yaml", ".yml")):
+        if option == "--config" and value.endswith(_YAML):
             class_paths |= _class_paths(shipped(value))
         elif group in class_paths and name in ("", "class_path"):
             class_paths[group] = value
@@ -211,9 +226,7 @@ def _check_words(command: str, words: list[str]) -> None:
     checkpoint_options = () if "--print_config" in words else _CHECKPOINT_OPTIONS
     for option, value in _options(words):
         _check_option(command, option, _OPTIONS)
-        is_yaml = option == "--config" and value.endswith((".yaml", ".yml"))
-        if is_yaml and not shipped(value).exists():
-            _refuse(command, f"--config: no file {value}")
+        _check_config(command, option, value)
         if option in checkpoint_options and not value.startswith((*_CHECKPOINT_WORDS, "hf:/")):
             try:
                 weights_file(value)
