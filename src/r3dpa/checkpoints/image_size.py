@@ -23,6 +23,8 @@ _OUTPUTS = (
     "decoder.conv_out.bias",
     "decoder.further_out.weight",
     "decoder.further_out.bias",
+    "decoder.further_refinement.features.weight",
+    "decoder.further_refinement.features.bias",
 )
 
 

@@ -97,9 +97,9 @@ def transfer_rgb(
 
 
 def with_further_channels(checkpoint: Checkpoint, vae: VAE) -> Checkpoint:
-    """Checkpoint of a VAE of range and return as one that has the intensity and class of ``vae``.
+    """Checkpoint of a VAE with the intensity, class and refinement that ``vae`` has and it lacks.
 
-    The layers of these channels have the values that they have in ``vae``, all others stay: the
+    The layers of these parts have the values that they have in ``vae``, all others stay: the
     encoder gives the same latents, and the decoder the same ranges and returns. Unchanged where the
     checkpoint lacks no such layer.
     """
@@ -115,6 +115,8 @@ def with_further_channels(checkpoint: Checkpoint, vae: VAE) -> Checkpoint:
 def without_further_channels(checkpoint: Checkpoint, vae: VAE) -> Checkpoint:
     """Checkpoint whose VAE decodes no intensity and class if ``vae`` has none; all else stays.
 
+    Without classes there is no refinement either, since it keeps away from leaves.
+
     Unchanged where the encoder sees them: without, its latents would be others.
     """
     weights = checkpoint.network("vae").state_dict
@@ -126,10 +128,10 @@ def without_further_channels(checkpoint: Checkpoint, vae: VAE) -> Checkpoint:
 
 
 def _with_channels_of(checkpoint: Checkpoint, vae: VAE, weights: Weights) -> Checkpoint:
-    """Checkpoint with these weights of a VAE and the intensity and class of ``vae``."""
+    """Checkpoint with these weights of a VAE, and the parts beside ranges that ``vae`` has."""
     state = checkpoint.network("vae")
-    channels = {"intensity": vae.intensity, "num_classes": vae.num_classes}
-    init_args = {**state.init_args, **channels, "encode_further": vae.encode_further}
+    further = ("intensity", "num_classes", "encode_further", "refinement")
+    init_args = {**state.init_args, **{name: getattr(vae, name) for name in further}}
     changed = replace(state, init_args=init_args, state_dict=weights)
     geometry = checkpoint.geometry
     if geometry is not None:

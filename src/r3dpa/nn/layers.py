@@ -58,7 +58,8 @@ class CircularConv2d(nn.Conv2d):
     """Convolution with circular padding of columns and zero padding of rows.
 
     The default padding keeps the size; an even kernel then reaches further right and down than
-    left and up. ``pads`` are ``(left, right, top, bottom)`` pixels, ``top <= bottom``.
+    left and up. ``pads`` are ``(left, right, top, bottom)`` pixels, ``top <= bottom``. With a
+    ``dilation`` the taps of the kernel lie that many pixels apart.
     """
 
     def __init__(
@@ -68,12 +69,15 @@ class CircularConv2d(nn.Conv2d):
         kernel_size: Size,
         stride: Size = (1, 1),
         pads: tuple[int, int, int, int] | None = None,
+        dilation: Size = (1, 1),
     ) -> None:
-        rows, columns = kernel_size
         if pads is None:
-            pads = ((columns - 1) // 2, columns // 2, (rows - 1) // 2, rows // 2)
+            rows, columns = kernel_size[0] - 1, kernel_size[1] - 1  # between first and last tap
+            rows, columns = rows * dilation[0], columns * dilation[1]
+            pads = (columns // 2, (columns + 1) // 2, rows // 2, (rows + 1) // 2)
         left, right, top, bottom = pads
-        super().__init__(in_channels, out_channels, kernel_size, stride, padding=(top, 0))
+        padding = (top, 0)
+        super().__init__(in_channels, out_channels, kernel_size, stride, padding, dilation)
         self.column_pads = (left, right, 0, 0)
         self.extra_row_pads = (0, 0, 0, bottom - top)
 

@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from einops import rearrange
 from torch import Tensor, nn
 
-from r3dpa.geometry import RangeCodec
+from r3dpa.geometry import SEMANTIC_CLASSES, RangeCodec
 from r3dpa.nn.layers import (
     AttentionBlock,
     CircularConv2d,
@@ -34,10 +34,12 @@ from r3dpa.nn.pixel_outputs import (
     without_flying_pixels,
     without_ripples,
 )
+from r3dpa.nn.refinement import Refinement
 
 # AdamW moves a weight by at most the learning rate per step: without this gain, logits need
 # hundreds of steps to learn even the class frequencies.
 _LOGIT_GAIN = 8.0
+_VEGETATION = [known.name for known in SEMANTIC_CLASSES].index("vegetation")
 LevelSizes = tuple[int, int, bool, Size | None]  # input, output, attention, stride
 
 
@@ -174,7 +176,8 @@ class VAE(Autoencoder):
     their own, whose kernels are 1 x 1 to save time. The encoder layer starts at 0, so that weights
     of a VAE without these channels give the same latents. Without
     ``encode_further`` there is none, and the latents, which tell of range and return alone, are
-    decoded to intensity and class as well.
+    decoded to intensity and class as well. A ``refinement`` corrects ranges and returns pixel by
+    pixel where the class is no vegetation, see :class:`r3dpa.nn.refinement.Refinement`.
 
     Source: Ran et al., "Towards realistic scene generation with LiDAR diffusion models" (CVPR
     2024); R3DPA (ICRA 2026) uses h2p4d8. State-dict keys follow the official checkpoints.
@@ -197,6 +200,7 @@ class VAE(Autoencoder):
         num_classes: Classes of the returns, whose number is the last channel of the images; 0 where
             they have none.
         encode_further: The encoder sees intensity and class, not the decoder alone.
+        refinement: Channels of the refinement, or 0 for none; needs two modes and classes.
 
     Example:
         >>> vae = VAE(channels=32, num_res_blocks=1)
@@ -221,6 +225,7 @@ class VAE(Autoencoder):
         intensity: bool = False,
         num_classes: int = 0,
         encode_further: bool = True,
+        refinement: int = 0,
     ) -> None:
         if least_scale <= 0:
             raise ValueError(f"least_scale must be above 0, got {least_scale}")
@@ -230,6 +235,11 @@ class VAE(Autoencoder):
             raise ValueError(
                 "intensity and num_classes need in_channels 2 (range and return), got "
                 f"{in_channels}"
+            )
+        if refinement and not (modes == 2 and num_classes):
+            raise ValueError(
+                f"refinement needs modes 2 and num_classes, got modes {modes} and num_classes "
+                f"{num_classes}"
             )
         num_levels = len(channel_multipliers)
         if len(strides) != num_levels - 1:
@@ -255,6 +265,9 @@ class VAE(Autoencoder):
         decoder = _Decoder(
             latent_channels, outputs, up, num_res_blocks + 1, legacy_upsample, stem, further
         )
+        if refinement:
+            size = (stem[0], stem[1])
+            decoder.further_refinement = Refinement(widths[0], refinement, size, least_scale)
         super().__init__(
             encoder,
             decoder,
@@ -264,7 +277,7 @@ class VAE(Autoencoder):
         )
         self.modes, self.least_scale = modes, least_scale
         self.intensity, self.num_classes = intensity, num_classes
-        self.encode_further = encode_further
+        self.encode_further, self.refinement = encode_further, refinement
 
     @property
     def image_channels(self) -> int:
@@ -425,6 +438,7 @@ class _Decoder(nn.Module):
         kernel = (1, 4) if by_pixel else (3, 3)
         self.conv_out = Float32CircularConv2d(first, out_channels * math.prod(stem), kernel)
         self.further_out: nn.Module | None = None
+        self.further_refinement: nn.Module | None = None
         if further:
             self.further_out = Float32CircularConv2d(first, further * math.prod(stem), (1, 1))
 
@@ -436,7 +450,12 @@ class _Decoder(nn.Module):
         outputs = self._pixels(self.conv_out(hidden))
         if self.further_out is None:
             return outputs
-        return torch.cat([outputs, self._pixels(self.further_out(hidden))], dim=1)
+        further = self._pixels(self.further_out(hidden))
+        if self.further_refinement is not None:
+            logits = _LOGIT_GAIN * further[:, -len(SEMANTIC_CLASSES) :].detach()
+            leaves = logits.softmax(dim=1)[:, _VEGETATION, None]
+            outputs = self.further_refinement(hidden, outputs, leaves)
+        return torch.cat([outputs, further], dim=1)
 
     def _pixels(self, blocks: Tensor) -> Tensor:
         rows, columns = self.stem
