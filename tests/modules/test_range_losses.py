@@ -59,16 +59,16 @@ class LabelledData(RangeData):
             batch["range_image"] = self.codec.to_image(range_m, intensity, classes)
 
 
-def range_module(modes, discriminator=None, train_encoder=True, labelled=False, **kwargs):
+def range_module(modes, discriminator=None, labelled=False, refinement=0, **kwargs):
     torch.manual_seed(0)
     further = {"intensity": True, "num_classes": NUM_CLASSES} if labelled else {}
+    further |= {"refinement": refinement}
     vae = VAE(2, 4, 32, (1,), (), 1, stem=(2, 2), modes=modes, **further)
-    settings = {
-        name: kwargs.pop(name) for name in {"latent_noise", "init_networks"} & kwargs.keys()
-    }
+    given = {"latent_noise", "init_networks", "train_encoder", "train_decoder"} & kwargs.keys()
+    settings = {name: kwargs.pop(name) for name in given}
     weights = LossWeights(vae_alignment=0.0, **kwargs)
     settings |= {"weights": weights, "optimizer": OptimizerConfig(lr=3e-3)}
-    settings |= {"discriminator": discriminator, "train_encoder": train_encoder}
+    settings |= {"discriminator": discriminator}
     return STAGES["vae_alignment"](vae=vae, sit=tiny_sit(), **settings)
 
 
@@ -167,6 +167,24 @@ def test_a_vae_with_other_channels_keeps_latents_ranges_and_returns(there, here)
         assert torch.equal(after.predict(latents)[:, :2], before.predict(latents)[:, :2])
 
 
+@pytest.mark.parametrize("change", [with_further_channels, without_further_channels])
+def test_a_vae_starts_with_and_without_the_refinement_of_another(change):
+    arguments = {"in_channels": 2, "channels": 32, "channel_multipliers": (1,), "strides": ()}
+    arguments |= {"stem": (2, 2), "modes": 2} | DECODED
+    refined = {"refinement": 4}
+    there, here = ({}, refined) if change is with_further_channels else (refined, {})
+    before, after = (VAE(**arguments, **further) for further in (there, here))
+    found = change(vae_checkpoint(before, arguments | there, LabelledData.codec), after)
+    load_into({"vae": after}, found, stage="joint")
+    assert ScanGeometry.from_dict(found.geometry).codec == LabelledData.codec
+    assert found.network("vae").build().refinement == after.refinement
+    image = torch.rand(1, 4, 8, 16)
+    with torch.no_grad():  # a refinement starts at 0
+        latents = after.encode(image[:, :2]).mean
+        assert torch.equal(latents, before.encode(image[:, :2]).mean)
+        assert torch.equal(after.predict(latents), before.predict(latents))
+
+
 def test_a_run_of_ranges_starts_from_a_checkpoint_whose_decoder_has_labels(tmp_path):
     arguments = {"in_channels": 2, "channels": 32, "channel_multipliers": (1,), "strides": ()}
     before = VAE(**arguments, **DECODED)
@@ -228,6 +246,23 @@ def test_a_decoder_is_trained_on_for_the_latents_of_a_fixed_encoder():
         n for n, value in module.vae.state_dict().items() if not torch.equal(value, before[n])
     }
     assert changed == {n for n in before if n.startswith(("decoder.", "post_quant_conv."))}
+
+
+def test_a_refinement_is_trained_alone():
+    module = range_module(
+        2, train_encoder=False, train_decoder=False, labelled=True, refinement=4, intensity=0.0
+    )
+    before = {name: value.clone() for name, value in module.vae.state_dict().items()}
+    train(module, LabelledData(4))
+    changed = {
+        n for n, value in module.vae.state_dict().items() if not torch.equal(value, before[n])
+    }
+    assert changed == {n for n in before if n.startswith("decoder.further_refinement.")}
+
+
+def test_something_must_be_left_to_train():
+    with pytest.raises(ValueError, match="has no refinement: nothing is left to train"):
+        range_module(2, train_encoder=False, train_decoder=False)
 
 
 @pytest.mark.parametrize("taken_over", [["vae"], ["vae", "latent_norm"]], ids="+".join)

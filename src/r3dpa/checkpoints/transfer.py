@@ -22,6 +22,7 @@ Result = Literal["kept", "fresh", "resized", "truncated", "dropped"]
 NORM_TOLERANCE = 0.05
 _NORM = "latent_norm."
 _PROJECTOR = "projector."
+_REFINEMENT = "further_refinement."
 
 
 class TransferRow(NamedTuple):
@@ -113,18 +114,28 @@ def with_further_channels(checkpoint: Checkpoint, vae: VAE) -> Checkpoint:
 
 
 def without_further_channels(checkpoint: Checkpoint, vae: VAE) -> Checkpoint:
-    """Checkpoint whose VAE decodes no intensity and class if ``vae`` has none; all else stays.
+    """Checkpoint whose VAE has no refinement, intensity and class that ``vae`` lacks.
 
-    Without classes there is no refinement either, since it keeps away from leaves.
-
-    Unchanged where the encoder sees them: without, its latents would be others.
+    All else stays. Intensity and class are left out together, and stay where the encoder sees them:
+    without, its latents would be others.
     """
+    if not vae.refinement:
+        checkpoint = _without_refinement(checkpoint)
     weights = checkpoint.network("vae").state_dict
     rest = {key: value for key, value in weights.items() if ".further_" not in key}
     encoded = any(key.startswith("encoder.further_") for key in weights)
     if vae.image_channels > vae.in_channels or len(rest) == len(weights) or encoded:
         return checkpoint
     return _with_channels_of(checkpoint, vae, rest)
+
+
+def _without_refinement(checkpoint: Checkpoint) -> Checkpoint:
+    state = checkpoint.network("vae")
+    rest = {key: value for key, value in state.state_dict.items() if _REFINEMENT not in key}
+    if len(rest) == len(state.state_dict):
+        return checkpoint
+    plain = replace(state, init_args={**state.init_args, "refinement": 0}, state_dict=rest)
+    return replace(checkpoint, networks={**checkpoint.networks, "vae": plain})
 
 
 def _with_channels_of(checkpoint: Checkpoint, vae: VAE, weights: Weights) -> Checkpoint:

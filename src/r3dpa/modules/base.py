@@ -247,8 +247,8 @@ class GenerativeModule(Stage):
     def previous_networks(self, before: Checkpoint) -> Checkpoint:
         """Checkpoint of the stage before, with the networks that this stage has.
 
-        Average velocities of stage few_step are left out, and so are intensity and class of a VAE
-        where this run decodes none, and projection heads that this run cannot use.
+        Average velocities of stage few_step are left out, and so are refinement, intensity and
+        class of a VAE where this run has none, and projection heads that this run cannot use.
         """
         networks = {}
         for name, state in before.networks.items():

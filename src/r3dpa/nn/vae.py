@@ -16,6 +16,7 @@ from einops import rearrange
 from torch import Tensor, nn
 
 from r3dpa.geometry import SEMANTIC_CLASSES, RangeCodec
+from r3dpa.geometry.semantics import NUM_CLASSES
 from r3dpa.nn.layers import (
     AttentionBlock,
     CircularConv2d,
@@ -236,9 +237,9 @@ class VAE(Autoencoder):
                 "intensity and num_classes need in_channels 2 (range and return), got "
                 f"{in_channels}"
             )
-        if refinement and not (modes == 2 and num_classes):
+        if refinement and (modes != 2 or num_classes != NUM_CLASSES):
             raise ValueError(
-                f"refinement needs modes 2 and num_classes, got modes {modes} and num_classes "
+                f"refinement needs modes 2 and num_classes {NUM_CLASSES}, got {modes} and "
                 f"{num_classes}"
             )
         num_levels = len(channel_multipliers)
@@ -452,7 +453,7 @@ class _Decoder(nn.Module):
             return outputs
         further = self._pixels(self.further_out(hidden))
         if self.further_refinement is not None:
-            logits = _LOGIT_GAIN * further[:, -len(SEMANTIC_CLASSES) :].detach()
+            logits = _LOGIT_GAIN * further[:, -NUM_CLASSES:].detach()
             leaves = logits.softmax(dim=1)[:, _VEGETATION, None]
             outputs = self.further_refinement(hidden, outputs, leaves)
         return torch.cat([outputs, further], dim=1)
