@@ -31,6 +31,7 @@ from r3dpa.geometry import (
 from r3dpa.nn import VAE, LatentNorm
 
 WIDE = SphericalProjection(replace(SENSOR, columns=128))
+NEAR = SphericalProjection(replace(SENSOR, range_max_m=7.0))
 
 
 @pytest.mark.parametrize("sampler", [ODE, SDE], ids=["ode", "sde"])
@@ -72,6 +73,35 @@ def test_single_returns_of_a_scene_are_dropped_by_its_number_and_seed():
     assert not torch.equal(scenes.decode(found.latents, [0, 1], seed=4) < 0, found.range_m < 0)
     alone = SceneGenerator(vae, sit, norm, geometry, ODE, batch_size=1)
     assert torch.equal(alone.decode(found.latents, [0, 1], seed=3) < 0, found.range_m < 0)
+
+
+def test_ranges_of_a_scene_have_noise_by_its_number_and_seed():
+    """For a decoder that smooths ranges along rings: a standard deviation of 1 cm."""
+    codec = RangeCodec("log2", return_channel=True)
+    geometry = ScanGeometry(SphericalProjection(SENSOR), codec, (2, 8))
+    _, sit, norm = tiny_networks()
+    vae = VAE(**VAE_ARGS | {"in_channels": 2, "modes": 2})
+    with torch.no_grad():
+        vae.decoder.conv_out.weight[5] = 0.0
+        vae.decoder.conv_out.bias[5] = 20.0  # all are returns
+    scenes = SceneGenerator(vae, sit, norm, geometry, ODE)
+    found = scenes.generate([0, 1], seed=3)
+    smooth = scenes.decode(found.latents)
+    returns = smooth > 0
+    assert torch.equal(returns, found.range_m > 0)
+    noise_m = (found.range_m - smooth)[returns]
+    assert noise_m.std().item() == pytest.approx(0.01, rel=0.1)
+    assert abs(noise_m.mean().item()) < 0.001
+    assert torch.equal(found.range_m[~returns], smooth[~returns])
+    again, other = (scenes.decode(found.latents, [0, 1], seed=seed) for seed in (3, 4))
+    assert torch.equal(again, found.range_m)
+    assert (other - again).std().item() == pytest.approx(0.01 * 2**0.5, rel=0.1)
+    alone = scenes.decode(found.latents[1:], [1], seed=3)
+    torch.testing.assert_close(alone, found.range_m[1:], atol=1e-3, rtol=0)  # rounding of a batch
+    near = SceneGenerator(vae, sit, norm, replace(geometry, projection=NEAR), ODE)
+    limited = near.decode(found.latents, [0, 1], seed=3)
+    assert limited.max() < NEAR.sensor.range_max_m
+    assert torch.equal(limited > 0, near.decode(found.latents) > 0)
 
 
 def test_global_random_state_is_neither_read_nor_moved():

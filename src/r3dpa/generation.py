@@ -22,7 +22,7 @@ from r3dpa.flow.autoguidance import (
     renormalised_times,
 )
 from r3dpa.flow.interpolant import Interpolant
-from r3dpa.flow.noise import scene_noise, scene_uniform
+from r3dpa.flow.noise import scene_noise, scene_normal, scene_uniform
 from r3dpa.flow.sampler import Quality, SamplerConfig
 from r3dpa.flow.solvers import Velocity
 from r3dpa.geometry import Pixels, ScanGeometry
@@ -31,6 +31,7 @@ from r3dpa.nn import VAE, AverageVelocitySiT, LatentNorm, VelocityNetwork
 from r3dpa.scenes import SceneBatch
 from r3dpa.scheduled_velocity import Autoguidance, ScheduledVelocity
 
+_RANGE_NOISE_M = 0.01  # of one surface in the scans that r3dpa-s has learned
 _GRAPH_BATCH = 8  # up to this many scenes, starting kernels takes as long as running them
 
 
@@ -341,8 +342,10 @@ class SceneGenerator:
     ) -> Pixels:
         """Ranges of normalised latents, and intensities and classes where the VAE has them.
 
-        Where images have a return channel, scenes with numbers ``indices`` of the collection
-        ``seed`` lose single returns at random, see :meth:`r3dpa.geometry.RangeCodec.drop_returns`.
+        Scenes with numbers ``indices`` of the collection ``seed`` get back what a VAE does not
+        encode: where images have a return channel, they lose single returns at random, see
+        :meth:`r3dpa.geometry.RangeCodec.drop_returns`, and where the decoder smooths ranges along
+        rings (two modes), they have range noise of 1 cm, as scans have.
 
         Raises:
             ValueError: If the latents do not have the shape of the VAE's latents, or the indices
@@ -360,16 +363,28 @@ class SceneGenerator:
             part = self.latent_norm.denormalise(latents[first : first + size].float())
             image = self._decode(pad_batch(part, size))[: len(part)].float()
             finite = image.flatten(1).isfinite().all(dim=1)
-            if indices is not None and codec.return_channel:
-                uniform = scene_uniform(image.shape[2:], indices[first : first + size], seed)
+            numbers = None if indices is None else indices[first : first + size]
+            if numbers is not None and codec.return_channel:
+                uniform = scene_uniform(image.shape[2:], numbers, seed)
                 image = codec.drop_returns(image, uniform.to(image.device))
             pixels = codec.pixels_of(image, sensor)
-            range_m = torch.where(finite[:, None, None], pixels.range_m, torch.nan)
+            range_m = pixels.range_m
+            if numbers is not None and self.vae.modes == 2:
+                range_m = self._with_noise(range_m, numbers, seed)
+            range_m = torch.where(finite[:, None, None], range_m, torch.nan)
             parts.append(pixels._replace(range_m=range_m))
         joined: list[Any] = [
             None if values[0] is None else torch.cat(values) for values in zip(*parts, strict=True)
         ]
         return Pixels(*joined)
+
+    def _with_noise(self, range_m: Tensor, indices: Sequence[int], seed: int) -> Tensor:
+        """Ranges ``(B, H, W)`` with the noise of a sensor, but not beyond its limits."""
+        sensor = self.geometry.projection.sensor
+        noise = scene_normal(range_m.shape[1:], indices, seed).to(range_m)
+        noisy = range_m + _RANGE_NOISE_M * noise
+        inside = (noisy > sensor.range_min_m) & (noisy < sensor.range_max_m)
+        return torch.where((range_m > 0) & inside, noisy, range_m)
 
     def velocity(self, latents: Tensor, time: Tensor) -> Tensor:
         """Unguided velocity ``(B, C, h, w)`` at times ``(B,)``, in the dtype of the latents."""

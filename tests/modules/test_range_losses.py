@@ -64,7 +64,7 @@ def range_module(modes, discriminator=None, labelled=False, refinement=0, **kwar
     further = {"intensity": True, "num_classes": NUM_CLASSES} if labelled else {}
     further |= {"refinement": refinement}
     vae = VAE(2, 4, 32, (1,), (), 1, stem=(2, 2), modes=modes, **further)
-    given = {"latent_noise", "init_networks", "train_encoder", "train_decoder"} & kwargs.keys()
+    given = {"latent_noise", "init_networks", "train_encoder"} & kwargs.keys()
     settings = {name: kwargs.pop(name) for name in given}
     weights = LossWeights(vae_alignment=0.0, **kwargs)
     settings |= {"weights": weights, "optimizer": OptimizerConfig(lr=3e-3)}
@@ -248,21 +248,10 @@ def test_a_decoder_is_trained_on_for_the_latents_of_a_fixed_encoder():
     assert changed == {n for n in before if n.startswith(("decoder.", "post_quant_conv."))}
 
 
-def test_a_refinement_is_trained_alone():
-    module = range_module(
-        2, train_encoder=False, train_decoder=False, labelled=True, refinement=4, intensity=0.0
-    )
-    before = {name: value.clone() for name, value in module.vae.state_dict().items()}
-    train(module, LabelledData(4))
-    changed = {
-        n for n, value in module.vae.state_dict().items() if not torch.equal(value, before[n])
-    }
-    assert changed == {n for n in before if n.startswith("decoder.further_refinement.")}
-
-
-def test_something_must_be_left_to_train():
-    with pytest.raises(ValueError, match="has no refinement: nothing is left to train"):
-        range_module(2, train_encoder=False, train_decoder=False)
+def test_a_refinement_is_trained_with_the_decoder():
+    module = train(range_module(2, labelled=True, refinement=4), LabelledData(30))
+    assert module.vae.decoder.further_refinement.conv_out.weight.count_nonzero()
+    assert module.parts[-1]["reconstruction"] < module.parts[0]["reconstruction"] - 0.01
 
 
 @pytest.mark.parametrize("taken_over", [["vae"], ["vae", "latent_norm"]], ids="+".join)

@@ -22,6 +22,11 @@ def scene_uniform(shape: Sequence[int], indices: Sequence[int], seed: int) -> Te
     return torch.stack([torch.rand(shape, generator=scene_random(seed, i, 1)) for i in indices])
 
 
+def scene_normal(shape: Sequence[int], indices: Sequence[int], seed: int) -> Tensor:
+    """Normal draws ``(B, H, W)`` per scene on the CPU, independent of both others."""
+    return torch.stack([torch.randn(shape, generator=scene_random(seed, i, 2)) for i in indices])
+
+
 def scene_random(seed: int, index: int, *stream: int) -> torch.Generator:
     """Random numbers of a scene, on the CPU; without a stream, the ones of its noise.
 

@@ -31,7 +31,6 @@ class VAEAlignment(GenerativeModule):
         discriminator: Patch discriminator; without it, no adversarial term.
         train_encoder: False freezes the encoder, so that an existing flow stays valid, and
             fine-tunes the decoder. Latent statistics that ``init_networks`` takes over stay too.
-        train_decoder: False freezes the decoder but for its refinement.
         train_patch_embed: Train the patch embedding (paper); False freezes it (official code).
         keep_projector: Keep the RGB model's projection head where its shape fits, as officially.
         **kwargs: See :class:`GenerativeModule`.
@@ -47,7 +46,6 @@ class VAEAlignment(GenerativeModule):
         sit: VelocityNetwork,
         discriminator: PatchDiscriminator | None = None,
         train_encoder: bool = True,
-        train_decoder: bool = True,
         train_patch_embed: bool = True,
         keep_projector: bool = True,
         **kwargs: Any,
@@ -55,15 +53,6 @@ class VAEAlignment(GenerativeModule):
         super().__init__(vae, sit, discriminator, keep_projector=keep_projector, **kwargs)
         for part in (self.vae.encoder, self.vae.quant_conv):
             part.requires_grad_(train_encoder)
-        for part in (self.vae.decoder, self.vae.post_quant_conv):
-            part.requires_grad_(train_decoder)
-        if self.vae.decoder.further_refinement is not None:
-            self.vae.decoder.further_refinement.requires_grad_(True)
-        elif not (train_encoder or train_decoder):
-            raise ValueError(
-                "train_encoder and train_decoder are false, and the VAE has no refinement: nothing "
-                "is left to train"
-            )
         self.keeps_statistics = not train_encoder and "latent_norm" in self.init_networks
         self.sit.requires_grad_(False)
         if self.weights.vae_alignment != 0:
