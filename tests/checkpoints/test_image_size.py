@@ -43,6 +43,7 @@ def test_a_stem_of_fewer_rows_makes_the_same_latents_of_a_coarser_image(shipped)
     networks = networks_for(shipped, (2, 8), (8, 64))
     before, rows = resize_to(networks, _without_average(shipped), shipped)
     layers = "vae: encoder.conv_in, decoder.conv_out, decoder.further_out"
+    layers += ", decoder.further_refinement.features"
     assert results(rows) == {layers: "resized", "sit: average": "dropped"}
     load_into(networks, before, "test")
     full = shipped.network("vae").build()

@@ -213,7 +213,8 @@ def test_the_shipped_weights_start_a_vae_with_and_without_intensity_and_class(fu
     arguments = shipped.network("ema").arguments
     del arguments["average_blocks"]
     sit = SiT(**{**arguments, "depth": 6})
-    plain = {"intensity": False, "num_classes": 0, "encode_further": True}
+    before.decoder.further_refinement = None
+    plain = {"intensity": False, "num_classes": 0, "encode_further": True, "refinement": 0}
     module = VAEAlignment(
         VAE(**{**shipped.network("vae").arguments, **plain, **further}),
         sit,

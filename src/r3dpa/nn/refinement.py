@@ -33,7 +33,7 @@ class Refinement(nn.Module):
     neighbours'.
 
     Leaves keep the ranges of the decoder, as far as it takes a pixel for leaves: the likeliest
-    ranges of a tree are those of a smooth surface, which no tree has.
+    ranges of a tree form a smooth surface, which no tree has.
 
     Args:
         width: Channels D of the decoder's features.
