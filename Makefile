@@ -195,7 +195,6 @@ r3dpa-s-more: $(READY) ## train weights on, in five hours of a core: labels, ali
 		--config conf/r3dpa_s_2/few_step.yaml --model.init_args.vae.init_args.encode_further false \
 		--run_dir $(SECOND)/aligned_few_step --model.init_args.init_from $(SECOND)/with_few_steps.safetensors
 	$(BIN)/r3dpa convert $(SECOND)/aligned_few_step/checkpoints/last.ckpt $(SECOND)/more.safetensors \
-		--decoder $(SECOND)/labels/checkpoints/last.ckpt \
 		--networks vae ema ema_latent_norm --half --overwrite
 
 r3dpa-s-control: $(READY) ## its control without alignment, latent noise and joint stage: after make r3dpa-s

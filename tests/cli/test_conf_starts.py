@@ -224,7 +224,8 @@ def test_the_second_edition_of_r3dpa_s_starts(name, start, tmp_path):
             f"{{class_path: {GEOMETRIC}, init_args: {{dim: 128}}}}"
         )
     if name.startswith("vae"):
-        vae = {key: value for key, value in vae.items() if key not in ("intensity", "num_classes")}
+        later = ("intensity", "num_classes", "refinement")
+        vae = {key: value for key, value in vae.items() if key not in later}
     if name in ("decoder_labels", "aligned"):
         vae["encode_further"] = False
     channels = {} if name.startswith("vae") else {"intensity_channel": True, "num_classes": 15}
