@@ -32,9 +32,6 @@ class Refinement(nn.Module):
     channels see features of the decoder and how the likelier range of each pixel differs from its
     neighbours'.
 
-    Leaves keep the ranges of the decoder, as far as it takes a pixel for leaves: the likeliest
-    ranges of a tree form a smooth surface, which no tree has.
-
     Args:
         width: Channels D of the decoder's features.
         channels: Channels at full resolution.
@@ -54,14 +51,13 @@ class Refinement(nn.Module):
 
     sizes: Tensor
 
-    def forward(self, features: Tensor, outputs: Tensor, leaves: Tensor) -> Tensor:
-        """Corrected outputs ``(B, 6, H, W)``.
+    def forward(self, features: Tensor, outputs: Tensor) -> Tensor:
+        """Correction ``(B, 6, H, W)`` to add to the outputs.
 
         Args:
             features: ``(B, D, h, w)`` of the decoder's last layer but one.
             outputs: ``(B, 6, H, W)`` of its last: see :class:`RangeMixture`, and the logit of a
                 return.
-            leaves: ``(B, 1, H, W)`` probability of vegetation.
         """
         rows, columns = self.stem
         hidden = rearrange(
@@ -71,8 +67,7 @@ class Refinement(nn.Module):
         hidden = self.conv_in(torch.cat([hidden, known], dim=1))
         for block in self.blocks:
             hidden = block(hidden)
-        correction = self.conv_out(F.silu(hidden)) * self.sizes
-        return outputs + (1 - leaves) * correction
+        return self.conv_out(F.silu(hidden)) * self.sizes
 
     def _known(self, outputs: Tensor) -> Tensor:
         """Differences to neighbours and between the modes, and the other outputs, about 1 in size.

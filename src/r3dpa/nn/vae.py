@@ -453,9 +453,11 @@ class _Decoder(nn.Module):
             return outputs
         further = self._pixels(self.further_out(hidden))
         if self.further_refinement is not None:
-            logits = _LOGIT_GAIN * further[:, -NUM_CLASSES:].detach()
-            leaves = logits.softmax(dim=1)[:, _VEGETATION, None]
-            outputs = self.further_refinement(hidden, outputs, leaves)
+            correction = self.further_refinement(hidden, outputs)
+            if not self.training:
+                logits = _LOGIT_GAIN * further[:, -NUM_CLASSES:]
+                correction = correction * (1 - logits.softmax(dim=1)[:, _VEGETATION, None])
+            outputs = outputs + correction
         return torch.cat([outputs, further], dim=1)
 
     def _pixels(self, blocks: Tensor) -> Tensor:
