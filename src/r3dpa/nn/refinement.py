@@ -32,6 +32,9 @@ class Refinement(nn.Module):
     channels see features of the decoder and how the likelier range of each pixel differs from its
     neighbours'.
 
+    A VAE corrects leaves in training alone. The likeliest ranges of a tree form a smooth surface,
+    which no tree has; a decoder that need not find them keeps its leaves rough.
+
     Args:
         width: Channels D of the decoder's features.
         channels: Channels at full resolution.

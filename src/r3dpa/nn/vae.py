@@ -178,7 +178,7 @@ class VAE(Autoencoder):
     of a VAE without these channels give the same latents. Without
     ``encode_further`` there is none, and the latents, which tell of range and return alone, are
     decoded to intensity and class as well. A ``refinement`` corrects ranges and returns pixel by
-    pixel where the class is no vegetation, see :class:`r3dpa.nn.refinement.Refinement`.
+    pixel, see :class:`r3dpa.nn.refinement.Refinement`; leaves in training alone.
 
     Source: Ran et al., "Towards realistic scene generation with LiDAR diffusion models" (CVPR
     2024); R3DPA (ICRA 2026) uses h2p4d8. State-dict keys follow the official checkpoints.
