@@ -15,8 +15,7 @@ import torch.nn.functional as F
 from einops import rearrange
 from torch import Tensor, nn
 
-from r3dpa.geometry import SEMANTIC_CLASSES, RangeCodec
-from r3dpa.geometry.semantics import NUM_CLASSES
+from r3dpa.geometry import NUM_CLASSES, SEMANTIC_CLASSES, RangeCodec
 from r3dpa.nn.layers import (
     AttentionBlock,
     CircularConv2d,
@@ -267,8 +266,7 @@ class VAE(Autoencoder):
             latent_channels, outputs, up, num_res_blocks + 1, legacy_upsample, stem, further
         )
         if refinement:
-            size = (stem[0], stem[1])
-            decoder.further_refinement = Refinement(widths[0], refinement, size, least_scale)
+            decoder.further_refinement = Refinement(widths[0], refinement, stem, least_scale)
         super().__init__(
             encoder,
             decoder,
@@ -454,7 +452,7 @@ class _Decoder(nn.Module):
         further = self._pixels(self.further_out(hidden))
         if self.further_refinement is not None:
             correction = self.further_refinement(hidden, outputs)
-            if not self.training:
+            if not self.training:  # leaves stay rough
                 logits = _LOGIT_GAIN * further[:, -NUM_CLASSES:]
                 correction = correction * (1 - logits.softmax(dim=1)[:, _VEGETATION, None])
             outputs = outputs + correction
