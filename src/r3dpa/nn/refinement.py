@@ -15,7 +15,8 @@ from r3dpa.nn.pixel_outputs import RangeMixture
 
 _NEIGHBOURS = (1, -1, 2, -2, 4, -4)  # columns
 _NUM_REFINED = RangeMixture.num_outputs + 1  # and the logit of a return
-_NUM_KNOWN = len(_NEIGHBOURS) + 2 + _NUM_REFINED - 1
+# Differences to neighbours, above, below, between the modes; and the outputs that are no range.
+_NUM_KNOWN = len(_NEIGHBOURS) + 3 + _NUM_REFINED - 2
 _DILATIONS = (1, 2, 4)  # columns between the taps of a kernel, block by block
 # Encoded ranges are compared up to 1 / 32, about 6 % of the range in log2; other outputs are
 # divided by 5. Both then lie near [-1, 1].
@@ -42,6 +43,8 @@ class Refinement(nn.Module):
         least_scale: See :class:`RangeMixture`.
     """
 
+    sizes: Tensor
+
     def __init__(self, width: int, channels: int, stem: Size, least_scale: float) -> None:
         super().__init__()
         self.stem, self.least_scale = (stem[0], stem[1]), least_scale
@@ -51,8 +54,6 @@ class Refinement(nn.Module):
         self.conv_out = zeroed(Float32CircularConv2d(channels, _NUM_REFINED, (3, 3)))
         sizes = torch.tensor(_CORRECTION).view(-1, 1, 1)
         self.register_buffer("sizes", sizes, persistent=False)
-
-    sizes: Tensor
 
     def forward(self, features: Tensor, outputs: Tensor) -> Tensor:
         """Correction ``(B, 6, H, W)`` to add to the outputs.
@@ -77,10 +78,10 @@ class Refinement(nn.Module):
 
         Differences, since bfloat16 would round the ranges themselves by more than they ripple.
         """
-        range_ = RangeMixture(outputs, self.least_scale).mode()
-        beside = [range_.roll(columns, -1) - range_ for columns in _NEIGHBOURS]
-        padded = F.pad(range_, (0, 0, 1, 1), mode="replicate")
-        above, below = padded[:, :, :-2] - range_, padded[:, :, 2:] - range_
+        likelier = RangeMixture(outputs, self.least_scale).mode()
+        beside = [likelier.roll(columns, -1) - likelier for columns in _NEIGHBOURS]
+        padded = F.pad(likelier, (0, 0, 1, 1), mode="replicate")
+        above, below = padded[:, :, :-2] - likelier, padded[:, :, 2:] - likelier
         modes = outputs[:, 1:2] - outputs[:, :1]
         differences = torch.cat([*beside, above, below, modes], dim=1)
         differences = (_RANGE_FACTOR * differences).clamp(-1, 1)
