@@ -384,7 +384,7 @@ class SceneGenerator:
         noise = scene_normal(range_m.shape[1:], indices, seed).to(range_m)
         noisy = range_m + _RANGE_NOISE_M * noise
         inside = (noisy > sensor.range_min_m) & (noisy < sensor.range_max_m)
-        return torch.where((range_m > 0) & inside, noisy, range_m)
+        return torch.where(inside, noisy, range_m)
 
     def velocity(self, latents: Tensor, time: Tensor) -> Tensor:
         """Unguided velocity ``(B, C, h, w)`` at times ``(B,)``, in the dtype of the latents."""
