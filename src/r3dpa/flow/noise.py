@@ -23,7 +23,7 @@ def scene_uniform(shape: Sequence[int], indices: Sequence[int], seed: int) -> Te
 
 
 def scene_normal(shape: Sequence[int], indices: Sequence[int], seed: int) -> Tensor:
-    """Normal draws ``(B, H, W)`` per scene on the CPU, independent of both others."""
+    """Normal draws ``(B, H, W)`` per scene on the CPU, in a stream of their own."""
     return torch.stack([torch.randn(shape, generator=scene_random(seed, i, 2)) for i in indices])
 
 
