@@ -34,6 +34,7 @@ from r3dpa.modules.checks import (
     check_planned_images,
     planned_geometry,
 )
+from r3dpa.modules.perceptual import PerceptualLoss
 from r3dpa.modules.settings import LossWeights, OptimizerConfig, PathName, TimeSampling
 from r3dpa.modules.stage import (
     PathDraws,
@@ -132,6 +133,7 @@ class GenerativeModule(Stage):
         self.ema: EMA | None = None
         if self.trains_velocity:
             self.ema = EMA(sit, self.latent_norm, ema_decay, ema_buffers)
+        self._perceptual_loss: PerceptualLoss | None = None
         self._has_weights = False
         self._previous_geometry: Mapping[str, Any] | None = None
 
@@ -270,11 +272,19 @@ class GenerativeModule(Stage):
     def vae_losses(
         self, image: Tensor, posterior: Posterior, prediction: Tensor
     ) -> dict[str, Tensor]:
-        """L_AE: reconstruction, KL and the adversarial term; the discriminator stays untouched."""
+        """L_AE: reconstruction, KL, perceptual and adversarial term.
+
+        The discriminator stays untouched.
+        """
         weights = self.weights
         parts = self.reconstruction_losses(image, prediction)
         if weights.kl != 0:
             parts["kl"] = weights.kl * posterior.kl().mean()
+        if weights.perceptual != 0:
+            if self._perceptual_loss is None:
+                self._perceptual_loss = PerceptualLoss(self.scan_geometry)
+            distance = self._perceptual_loss(self.vae.image_of(prediction), image)
+            parts["perceptual"] = weights.perceptual * distance
         adversarial = weights.adversarial != 0 and self.global_step >= weights.adversarial_start
         if self.discriminator is not None and adversarial:
             scan = self.vae.scan_of(prediction)

@@ -25,6 +25,8 @@ class LossWeights:
         intensity: Weight of the absolute error of the encoded intensity at returns, likewise.
         classes: Weight of the cross-entropy of the class of labelled returns, likewise.
         kl: Weight of the Kullback-Leibler term, summed per sample.
+        perceptual: Weight of the distance between what a network on points sees in reconstruction
+            and scan, see :class:`r3dpa.modules.perceptual.PerceptualLoss`.
         adversarial: Weight of the generator's adversarial loss (official 0.3 x 0.001).
         adversarial_ratio: Target ratio of adversarial to L1 gradient norm at the image (adaptive
             weight of VQGAN). Overrides ``adversarial``. Default: fixed weight, at which the
@@ -55,6 +57,7 @@ class LossWeights:
     intensity: float = 1.0
     classes: float = 0.2
     kl: float = 1e-6
+    perceptual: float = 0.0
     adversarial: float = 3e-4
     adversarial_ratio: float | None = None
     discriminator: float = 1e-3
