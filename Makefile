@@ -181,7 +181,7 @@ r3dpa-s: $(READY) ## train the second edition of r3dpa-s: 20 hours of a core; st
 	$(BIN)/r3dpa data objects --data conf/r3dpa_s_2/data.yaml --ckpt $(SECOND)/r3dpa-s.safetensors \
 		--out $(SECOND)/r3dpa-s.objects
 
-r3dpa-s-more: $(READY) ## train weights on, in five hours of a core: labels, alignment, few steps [FROM=r3dpa-s]
+r3dpa-s-more: $(READY) ## train weights on, in seven hours of a core: labels, alignment, few steps [FROM=r3dpa-s]
 	OMP_NUM_THREADS=1 nice -n 19 $(BIN)/r3dpa data prepare $(SECOND_ALIGNED)
 	$(FIT_SECOND) $(SECOND_DATA) --config conf/r3dpa_s_2/vae_alignment.yaml \
 		--config conf/r3dpa_s_2/decoder_labels.yaml --run_dir $(SECOND)/labels \
