@@ -21,7 +21,7 @@ from r3dpa.checkpoints import (
 from r3dpa.cli import main
 from r3dpa.flow.autoguidance import renormalised
 from r3dpa.geometry import ScanGeometry
-from r3dpa.modules import FlowMatching, VAEAlignment
+from r3dpa.modules import FlowMatching, JointAlignment, VAEAlignment
 from r3dpa.nn import VAE, LatentNorm, PatchDiscriminator, SiT
 
 
@@ -134,7 +134,16 @@ def test_a_stage_without_average_says_that_it_keeps_none(tmp_path, caplog):
     assert made.ema is None
     with caplog.at_level("INFO", "lightning.pytorch.utilities.rank_zero"):
         assert run(EMASnapshots(steps=[1]), made, tmp_path, [1]) == []
-    assert "vae_alignment averages no SiT" in caplog.text
+    assert "stage vae_alignment averages no SiT" in caplog.text
+
+
+def test_a_stage_that_trains_its_vae_keeps_none(tmp_path, caplog):
+    """No later SiT has the latents of that step, so `read_snapshot` would refuse it."""
+    joint = module(JointAlignment, discriminator=PatchDiscriminator(channels=4))
+    assert joint.ema is not None
+    with caplog.at_level("INFO", "lightning.pytorch.utilities.rank_zero"):
+        assert run(EMASnapshots(steps=[1]), joint, tmp_path, [1]) == []
+    assert "stage joint averages no SiT over fixed latents" in caplog.text
 
 
 def test_a_resumed_run_replaces_what_an_abandoned_one_left_after_its_checkpoint(tmp_path):

@@ -1,5 +1,6 @@
 import math
 import re
+import shutil
 from itertools import chain
 from pathlib import Path
 
@@ -305,6 +306,16 @@ class TestNamedSensors:
         assert not {scan.path for scan in train} & {scan.path for scan in val}
         module.setup("predict")  # each scan once
         assert module.all_set.scans == sorted({*train, *val})
+
+    def test_scans_of_two_data_sets_may_have_the_same_names(self, tmp_path, folders):
+        for name in ("real", "simulated"):
+            shutil.copytree(folders / "simulated", tmp_path / name / "drive")
+        module = LidarDataModule(
+            str(tmp_path / "real"), val_every=None, further_scans=str(tmp_path / "simulated")
+        )
+        module.setup("predict")
+        paths = [scan.path for scan in module.all_set.scans]
+        assert sorted(paths) == sorted(tmp_path.glob("*/drive/*.bin"))
 
     def test_settings_of_an_image_keep_their_projection_and_codec(self, folders):
         module = LidarDataModule(str(folders / "own"), sensor=LidarSensor(16, 512))

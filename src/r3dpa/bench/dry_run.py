@@ -128,9 +128,10 @@ class DryRun:
         if saver.save_top_k < 0 < trainer.max_steps:
             count = math.ceil(trainer.max_steps / saver.every_n_train_steps)
         parts = [f"{count} checkpoints of {_size(size)}, {_size(count * size)}"]
-        ema = self.module.ema if isinstance(self.module, GenerativeModule) else None
         for callback in trainer.callbacks:
-            if isinstance(callback, EMASnapshots) and ema is not None:
+            if not isinstance(callback, EMASnapshots):
+                continue
+            if (ema := callback.average_of(self.module)) is not None:
                 count = len(callback.fractions if callback.steps is None else callback.steps)
                 size = sum(tensor.nbytes for tensor in ema.sit.state_dict().values())
                 parts += [f"{count} snapshots of {_size(size)}, {_size(count * size)}"]

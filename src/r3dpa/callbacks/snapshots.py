@@ -12,6 +12,7 @@ from lightning.pytorch.utilities import rank_zero_info
 
 from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint, vae_fingerprint
 from r3dpa.modules import GenerativeModule
+from r3dpa.nn import EMA
 
 _NORM_ARGS = ("channels", "eps", "momentum", "legacy_inverse", "replace_non_finite")
 
@@ -21,7 +22,8 @@ class EMASnapshots(L.Callback):
 
     Each step makes ``<run_dir>/snapshots/step_<step>.safetensors`` with its ``.yaml``: average,
     latent statistics, geometry, and a hash of the VAE, which is not kept. SiT-B/2 takes 550 MB. A
-    run that is resumed from an earlier step replaces them. A stage without average writes none.
+    run that is resumed from an earlier step replaces them. A stage without average writes none, nor
+    does one that trains its VAE: no later SiT would have the same latents.
 
     Source: Karras et al. 2024 guide EDM2-S best by a model after 1/16 of its training.
 
@@ -40,13 +42,23 @@ class EMASnapshots(L.Callback):
         self._due: frozenset[int] = frozenset()
         self._step = 0  # after the last batch
 
+    @staticmethod
+    def average_of(module: L.LightningModule) -> EMA | None:
+        """Average of a stage, None where it has none or trains the VAE that gives the latents."""
+        if not isinstance(module, GenerativeModule) or "vae" in module.trainable():
+            return None
+        return module.ema
+
     def on_fit_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Determine the steps, and refuse early what could not be written."""
         self._due = frozenset()
-        if not isinstance(pl_module, GenerativeModule) or pl_module.ema is None:
+        if self.average_of(pl_module) is None:
             stage = getattr(pl_module, "stage", type(pl_module).__name__)
-            rank_zero_info(f"stage {stage} averages no SiT: no snapshots are kept")
+            rank_zero_info(
+                f"stage {stage} averages no SiT over fixed latents: no snapshots are kept"
+            )
             return
+        assert isinstance(pl_module, GenerativeModule)
         _sit_config(pl_module)
         if cast(Any, trainer).fast_dev_run:
             return

@@ -41,12 +41,12 @@ class Scan:
 
     ``drive`` is the KITTI-360 drive, or the folder relative to the root; ``frame`` the file name
     without its suffix; ``columns`` the names of the columns of a file without names, see
-    :func:`lidarsim.scan_files.read_scan`.
+    :func:`lidarsim.scan_files.read_scan`. Scans of two data sets may have the same drive and frame.
     """
 
     drive: str
     frame: str
-    path: Path = field(compare=False)
+    path: Path
     columns: tuple[str, ...] = field(default=(), compare=False)
 
     @property
