@@ -6,6 +6,7 @@ from tiny_stages import (
     ARGUMENTS,
     QUIET,
     NamedData,
+    TinyData,
     constant_loss,
     guarded,
     infinite_image,
@@ -15,12 +16,13 @@ from tiny_stages import (
 
 from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint
 from r3dpa.cli.runs import replay
+from r3dpa.modules import LossWeights
 from r3dpa.nn import AverageVelocitySiT
 
 pytestmark = QUIET
 
 
-def save(module, path):
+def save(module, path, geometry=None):
     networks = {}
     for name, arguments in ARGUMENTS.items():
         network = getattr(module, name, None)
@@ -28,7 +30,7 @@ def save(module, path):
             if isinstance(network, AverageVelocitySiT):
                 arguments = arguments | {"average_blocks": len(network.average.blocks)}
             networks[name] = NetworkState.of(network, arguments)
-    save_checkpoint(Checkpoint(path, module.stage, networks), path)
+    save_checkpoint(Checkpoint(path, module.stage, networks, geometry=geometry), path)
     return path
 
 
@@ -56,6 +58,28 @@ def test_the_losses_of_the_step_come_back(stage, tmp_path):
     assert now.endswith(f"loss {total:.3g}")
     assert "layers whose output is not finite: 0, from finite inputs: none" in text
     assert "\nthese weights give finite values for this batch" in text
+
+
+def test_the_perceptual_loss_has_the_geometry_of_the_weights(tmp_path):
+    weights = LossWeights(vae_alignment=0.0, perceptual=0.01)
+    module = guarded("vae_alignment", [0], constant_loss, weights=weights)
+    train(module, NamedData(1), default_root_dir=tmp_path)
+    (file,) = (tmp_path / "bad_batches").iterdir()
+    ckpt = save(
+        stage_module("vae_alignment"), tmp_path / "before.safetensors", TinyData.geometry.to_dict()
+    )
+    losses = replay(file, ckpt).split("losses now:")[1]
+    assert "perceptual" in losses.splitlines()[0]
+
+
+def test_a_stage_of_another_package_is_named(file, tmp_path):
+    saved = torch.load(file, weights_only=True) | {"stage": "mine"}
+    torch.save(saved, tmp_path / "mine.pt")
+    ckpt = save(stage_module("joint"), tmp_path / "before.safetensors")
+    with pytest.raises(
+        ValueError, match=r"mine\.pt is of stage mine, but only vae_alignment, joint"
+    ):
+        replay(tmp_path / "mine.pt", ckpt)
 
 
 def test_a_broken_input_is_told_from_a_broken_layer(tmp_path):

@@ -17,7 +17,7 @@ from r3dpa.cli.class_arguments import class_arguments
 from r3dpa.cli.fit import check_class_arguments
 from r3dpa.cli.messages import argument_names
 from r3dpa.cli.parser import load, make_parser
-from r3dpa.cli.presets import conf_folder, expand_preset, stage_files
+from r3dpa.cli.presets import conf_folder, expand_preset, find_configs, stage_files
 
 MISTAKES = {
     "fit": "give a stage, or --config FILE",
@@ -199,9 +199,18 @@ def test_fit_alone_names_stages_and_presets(answers):
 def test_overlays_are_no_stages():
     assert {"joint", "flow_matching", "r2flow"} <= set(stage_files())
     assert not {"joint_demo", "r2flow_reflow", "r2flow_distilled"} & set(stage_files())
-    words, preset = expand_preset(["joint", "--preset", "demo", "--trainer.max_steps", "3"])
-    assert preset == "demo"
-    assert words[-4:] == ["--run_dir", "runs/demo/joint", "--trainer.max_steps", "3"]
+    for preset in (["--preset", "demo"], ["--preset=demo"]):
+        words, name = expand_preset(["joint", *preset, "--trainer.max_steps", "3"])
+        assert name == "demo"
+        assert words[-4:] == ["--run_dir", "runs/demo/joint", "--trainer.max_steps", "3"]
+
+
+@pytest.mark.parametrize("option", ["--config", "-c"])
+def test_configurations_of_the_package_are_found_from_any_folder(option, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    file = str(conf_folder() / "trainer.yaml")
+    assert find_configs([option, "conf/trainer.yaml"]) == [option, file]
+    assert find_configs([f"{option}=conf/trainer.yaml"]) == [f"{option}={file}"]
 
 
 @pytest.mark.parametrize(

@@ -16,17 +16,16 @@ import torch
 
 from r3dpa import viz
 from r3dpa.ablation.plan import Plan, PlannedStage, Row, Table
-from r3dpa.feature_names import SPACES
 from r3dpa.io import command, machine, versions, write_text
 from r3dpa.metrics.resampling import Ends, quantile_of_t
 from r3dpa.metrics.results import (
+    DISTANCES,
     Evaluation,
     EvaluationTable,
     published_evaluation,
     save_csv,
 )
 
-_DISTANCES = ("JSD", "MMD", *(space.upper() for space in SPACES))
 _ALIKE = 0.05  # share; a few times the differences of such rows in the paper
 _SUFFIXES = (".md", ".tex", ".csv", ".json")
 # The paper compares with all real scans, but in MMD with validation scans alone.
@@ -153,7 +152,7 @@ def write_table(plan: Plan, table: Table, failed: Mapping[str, str]) -> tuple[st
         for suffix in _SUFFIXES:  # files of an earlier run would look like results of this one
             file.with_suffix(suffix).unlink(missing_ok=True)
         return f"{table.name}: {table.caption}\n\nno row has a result", results
-    distances = [evaluation.only(_DISTANCES) for evaluation in means]
+    distances = [evaluation.only(DISTANCES) for evaluation in means]
     shown = EvaluationTable((*_published(table), *distances))
     measured = {row.name: row.direction == "lower" for e in distances for row in e.rows}
     orders = order_results(table, results, measured)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
@@ -33,13 +34,13 @@ def shipped(path: str | Path) -> Path:
 
 
 def find_configs(words: Sequence[str]) -> list[str]:
-    """Replace the files after ``--config`` by those that :func:`shipped` finds."""
+    """Replace the files after ``--config`` or ``-c`` by those that :func:`shipped` finds."""
     replaced: list[str] = []
     for word in words:
         name, _, value = word.partition("=")
-        if name == "--config" and value.startswith("conf/"):
-            word = f"--config={shipped(value)}"
-        elif replaced[-1:] == ["--config"] and word.startswith("conf/"):
+        if name in ("--config", "-c") and value.startswith("conf/"):
+            word = f"{name}={shipped(value)}"
+        elif replaced and replaced[-1] in ("--config", "-c") and word.startswith("conf/"):
             word = str(shipped(word))
         replaced.append(word)
     return replaced
@@ -63,11 +64,10 @@ def expand_preset(words: list[str]) -> StageWords:
     """
     if not words or words[0].startswith("-"):
         return StageWords(words, None)
-    stage, rest, preset = words[0], list(words[1:]), DEFAULT_PRESET
-    if "--preset" in rest[:-1]:
-        place = rest.index("--preset")
-        preset = rest[place + 1]
-        del rest[place : place + 2]
+    parser = argparse.ArgumentParser(prog="r3dpa", add_help=False, allow_abbrev=False)
+    parser.add_argument("--preset", default=DEFAULT_PRESET)
+    given, rest = parser.parse_known_args(words[1:])
+    stage, preset = words[0], given.preset
     conf, demo, stages = conf_folder(), preset == "demo", stage_files()
     check_known("stage", stage, list(stages))
     check_known("preset", preset, preset_names())

@@ -96,14 +96,21 @@ def replay(file: Path, ckpt: Path, device: str = "cpu") -> str:
     """
     from r3dpa.callbacks.bad_batches import format_values, read_bad_batch
     from r3dpa.checkpoints import read_checkpoint
+    from r3dpa.geometry import ScanGeometry
     from r3dpa.modules import FewStep, FlowMatching, JointAlignment, LossWeights, VAEAlignment
 
     saved, weights = read_bad_batch(file), read_checkpoint(ckpt)
     stages = {s.stage: s for s in (VAEAlignment, JointAlignment, FlowMatching, FewStep)}
+    if saved["stage"] not in stages:
+        raise ValueError(
+            f"{file} is of stage {saved['stage']}, but only {', '.join(stages)} can be repeated"
+        )
     known = {"vae", "sit", "latent_norm", "discriminator", "thin_decoder"} & set(weights.networks)
     networks: Any = {name: weights.network(name).build() for name in known}
     settings = LossWeights(**saved["weights"])
     module = stages[saved["stage"]](**networks, weights=settings, path=saved["path"]).to(device)
+    if weights.geometry is not None:
+        module.geometry = ScanGeometry.from_dict(dict(weights.geometry))
     draws = saved["draws"]._make(value.to(device) for value in saved["draws"])
     batch: Any = {name: value.to(device) for name, value in saved["batch"].items()}
     # Without a trainer there is no number of the batch, and nothing to log to.

@@ -19,6 +19,7 @@ from typing import Any, Literal, Self
 
 from tabulate import LATEX_ESCAPE_RULES
 
+from r3dpa.feature_names import SPACES
 from r3dpa.io import text_table, write_text
 from r3dpa.metrics.resampling import Ends
 
@@ -43,7 +44,8 @@ _UNKNOWN_DATASET = (
     "- published numbers left out: the reference does not say whether it is of KITTI-360; "
     "compute it again with `r3dpa data reference`\n"
 )
-_DISTANCES = (*PUBLISHED_SCALES, "FWID", "FGEO")
+#: Distances of the main tables, those of the paper first.
+DISTANCES = tuple(dict.fromkeys([*PUBLISHED_SCALES, *(space.upper() for space in SPACES)]))
 #: Provenance of an evaluation, by default unknown.
 _ABOUT: dict[str, Any] = {
     "backbones": {},  # card of each feature network
@@ -401,8 +403,8 @@ def _comparison(
     evaluation: Evaluation, reference: Mapping[str, Any], earlier: Sequence[Evaluation]
 ) -> EvaluationTable:
     if earlier:
-        return EvaluationTable([e.only(_DISTANCES) for e in (*earlier, evaluation)])
-    distances = evaluation.only(_DISTANCES)
+        return EvaluationTable([e.only(DISTANCES) for e in (*earlier, evaluation)])
+    distances = evaluation.only(DISTANCES)
     if reference.get("dataset") != PUBLISHED_DATASET:
         return EvaluationTable([distances])
     names = [row.name for row in distances.rows]
