@@ -11,6 +11,7 @@ from r3dpa.data import (
     SimulatedDataModule,
     SimulatedImageDataModule,
 )
+from r3dpa.data.store import StoreError
 from r3dpa.features import Masking, ScanGrid
 from r3dpa.geometry import (
     NUM_CLASSES,
@@ -144,6 +145,20 @@ def test_grids_of_labelled_images_are_made_of_their_pixels_without_simulating(
             sums = torch.where(filled, blocks, 0.0).sum(dim=(1, 3)).flatten()
             expected = sums / count.clamp(min=1)
             torch.testing.assert_close(grid[:, channel], expected, rtol=2e-3, atol=1e-3)
+
+
+def test_grids_of_another_extractor_are_refused_before_anything_is_added(tmp_path):
+    module(tmp_path, codec=LABELLED, num_scans=4, extractor=_Intensities()).prepare_data()
+    before = contents(tmp_path)
+    other = _Intensities()
+    other.settings = {"weights": "others"}
+    with pytest.raises(StoreError, match="were made with extractor"):
+        module(tmp_path, codec=LABELLED, num_scans=8, extractor=other).prepare_data()
+    assert contents(tmp_path) == before
+
+
+def contents(folder):
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def test_points_and_classes_of_a_labelled_image_train_a_network_on_points(tmp_path):

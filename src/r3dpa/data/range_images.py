@@ -21,7 +21,7 @@ from tqdm import tqdm
 from lidarsim import SIMULATOR_VERSION, TRAIN_DRIVES, VAL_DRIVES, Simulator, split_scans
 from r3dpa.data.datamodules import SimulatedDataModule
 from r3dpa.data.datasets import PointDataset, PointSample
-from r3dpa.data.feature_grids import Extractor, GridSettings, extract_grids, pooled_grids
+from r3dpa.data.feature_grids import Extractor, extract_grids, plan, pooled_grids
 from r3dpa.data.loaders import at_least, plain_loader
 from r3dpa.data.store import CachedTensors, ItemKey, Store, tensor_cache
 from r3dpa.geometry import (
@@ -125,20 +125,22 @@ class SimulatedImageDataModule(SimulatedDataModule):
         train, val = self.limited_split()
         images: list[Any] = sorted(train + val)
         projection = self.known_projection
-        grids = None
-        if self.features_dir is not None and self.extractor is not None:
-            extractor = cast(Extractor, self.extractor.eval())
-            settings = GridSettings.of(extractor, projection, self.grid_size)
-            grids = settings.store(self.features_dir)
+        predicting = self.trainer is not None and self.trainer.predicting
+        grids: Store | None = None
+        without_grids: Sequence[Any] = ()
         with only_writer(Path(self.root) / ".lock", f"simulates into {self.root}", wait=True):
             missing = set(self._store.missing(images))
-            if grids is not None and not self.has_values:
-                missing |= set(grids.missing(images))
+            if self.features_dir is not None and self.extractor is not None and not predicting:
+                extractor = cast(Extractor, self.extractor.eval())
+                todo = plan(images, extractor, projection, [self.grid_size], self.features_dir)
+                grids, without_grids = todo.stores[self.grid_size], todo.missing
+                if not self.has_values:
+                    missing |= set(without_grids)
             if missing:
                 made_with = None if self.has_values else grids
                 self._simulate(sorted(missing), projection, made_with)
             if grids is not None and self.has_values:
-                self._write_grids(grids, grids.missing(images))
+                self._write_grids(grids, without_grids)
 
     @cached_property
     def images(self) -> CachedPixels:
