@@ -143,7 +143,8 @@ class PointCloud:
     def intensity_shares(self, full_scale: float | None = None) -> NDArray[np.float32]:
         """Intensities ``(P,)`` as shares of a full scale, 0 where the file has none.
 
-        The default full scale is 1, or 255 for integers and where intensities exceed 1.
+        The default full scale is 1, or 255 for integers and where intensities exceed 1, or 65535
+        of LAS files.
 
         Raises:
             ScanError: If intensities exceed 255 and no ``full_scale`` is given.

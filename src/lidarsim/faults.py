@@ -67,7 +67,7 @@ class Fault:
         strength: In place of the severity, in the unit of :data:`STRENGTHS`.
 
     Raises:
-        ValueError: If severity or strength are out of range.
+        ValueError: If the kind is unknown, or severity or strength are out of range.
     """
 
     kind: Kind
@@ -75,6 +75,8 @@ class Fault:
     strength: float | None = None
 
     def __post_init__(self) -> None:
+        if self.kind not in STRENGTHS:
+            raise ValueError(f"unknown fault {self.kind!r}; choose from {', '.join(STRENGTHS)}")
         _, most, unit = STRENGTHS[self.kind]
         if self.severity not in range(4):
             raise ValueError(f"severity must be 0, 1, 2 or 3, got {self.severity}")

@@ -113,7 +113,7 @@ class Instrument:
     """Assumed properties of the instrument that recorded a scan.
 
     Args:
-        sensor: Its detection limit, beam, pulse and noise: ``hdl64e``, ``hdl32e``, ``vls128``, a
+        sensor: Its detection limit, beam, pulse and noise: a preset such as ``hdl32e``, a
             calibration file or a :class:`SpinningLidar`; its lasers are not used.
         returns: Which echoes of a shot it reports.
         full_intensity: Intensity of a white surface in front of it. Default: from the 99.9 %

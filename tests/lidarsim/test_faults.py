@@ -142,6 +142,8 @@ def test_semantic_kitti_classes_are_told_by_those_that_only_it_has():
 
 
 def test_what_is_missing_or_out_of_range_is_named():
+    with pytest.raises(ValueError, match="unknown fault 'fog'; choose from missing_beams, fewer"):
+        Fault("fog")
     with pytest.raises(ValueError, match="severity must be 0, 1, 2 or 3, got 4"):
         Fault("crosstalk", 4)
     with pytest.raises(ValueError, match=r"strength must lie in 0\.\.1 \(of the points\), got 1.5"):

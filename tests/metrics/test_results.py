@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from r3dpa.feature_names import SPACES
 from r3dpa.metrics.resampling import Resampling
 from r3dpa.metrics.results import (
     Evaluation,
@@ -347,3 +348,13 @@ def test_published_numbers_stand_beside_references_of_their_data_set(dataset, sh
     text = report(evaluation, {"split": "all", "dataset": dataset})
     assert ("R3DPA (published)" in text) == shown
     assert "| ours" in text
+
+
+def test_tables_beside_others_have_every_distance_and_no_other_metric():
+    rows = [MetricResult(space.upper(), 1.0) for space in SPACES]
+    earlier = Evaluation("before", (*rows, MetricResult("W1 range", 1.0)))
+    text = report(Evaluation("ours", tuple(rows)), {}, [earlier])
+    table = [line for line in text.splitlines() if line.startswith("| ours")]
+    heads = text[: text.index(table[0])]
+    assert all(f" {space.upper()} " in heads for space in SPACES)
+    assert "W1" not in heads

@@ -273,7 +273,7 @@ class _Hydrometeors(Effect):
     intercept: tuple[float, float]  # n per m^3 and mm, and a
     slope: tuple[float, float]  # l per mm, and b
     origin: Origin
-    field: str  # of Weather, its rate in mm/h
+    field: str  # of Conditions, its rate in mm/h
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
         rate = getattr(scene.weather, self.field)

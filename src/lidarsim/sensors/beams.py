@@ -55,7 +55,6 @@ class ColumnFit(NamedTuple):
     coherence: float  # 1 if azimuths lie on equal steps, 0 if anywhere
     lateral_m: Floats  # (H,)
     offset: Floats  # (H,) azimuth within a column, in [0, 2 pi / columns); 0 where unknown
-    residual: Floats  # (P,) azimuth minus the nearest step
     dropped_share: float  # of the shots on surfaces
     double_share: float  # points of the same shot as their neighbour
     turns: float  # of the head within a scan; less where points are in another order
@@ -154,14 +153,11 @@ def fit_columns(beam: Indices, azimuth: Floats, distance_m: Floats, scan: Indice
     column_rad = 2 * math.pi / columns
     offset, agreement = _phase(beam, straight, columns, num_beams)
     offset[agreement < _COHERENT] = 0.0
-    residual = (straight - offset[beam] + column_rad / 2) % column_rad - column_rad / 2
 
     shots = (straight[after] - straight[before]) / column_rad
     dropped_share = _dropped_share(shots[is_level])
     double_share = float((np.abs(shots) < _DOUBLE_STEP).sum() / len(azimuth))
-    return ColumnFit(
-        columns, coherence, lateral_m, offset, residual, dropped_share, double_share, turns
-    )
+    return ColumnFit(columns, coherence, lateral_m, offset, dropped_share, double_share, turns)
 
 
 def _dropped_share(shots: Floats) -> float:

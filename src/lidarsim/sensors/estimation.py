@@ -61,7 +61,8 @@ class SensorEstimate:
     Args:
         sensor: Its beams, columns, range limits and height; the rest is as for the HDL-64E.
         num_scans: Number of scans that were combined.
-        beams_by: ``stored``, ``order`` or ``inclination``, see :func:`lidarsim.rings.rings_of`.
+        beams_by: ``a stored ring``, ``the order`` or ``the inclination``, see
+            :func:`lidarsim.rings.rings_of`.
         confidence: Share from 0 to 1 by quantity.
         residual_deg: ``(H, 5)`` quantiles 5, 25, 50, 75 and 95 % of the angle of the points of each
             beam to its line, degrees.

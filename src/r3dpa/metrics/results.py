@@ -44,7 +44,7 @@ _UNKNOWN_DATASET = (
     "- published numbers left out: the reference does not say whether it is of KITTI-360; "
     "compute it again with `r3dpa data reference`\n"
 )
-#: Distances of the main tables, those of the paper first.
+#: Distances of the main tables, the ones in the paper first.
 DISTANCES = tuple(dict.fromkeys([*PUBLISHED_SCALES, *(space.upper() for space in SPACES)]))
 #: Provenance of an evaluation, by default unknown.
 _ABOUT: dict[str, Any] = {
