@@ -17,7 +17,7 @@ import threading
 import tokenize
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from io import FileIO
@@ -216,7 +216,7 @@ def only_writer(lock: Path, what: str, wait: bool = False) -> Iterator[None]:
 
 
 def in_processes(function: Callable[[T], R], tasks: Sequence[T], workers: int) -> Iterator[R]:
-    """Yield results of a function as they are ready, in any order; one worker is this process.
+    """Yield results of a function in the order of the tasks; one worker is this process.
 
     Workers ignore interrupts and end when this process is killed. ``ChildProcessError`` if one of
     them was killed.
@@ -231,7 +231,7 @@ def in_processes(function: Callable[[T], R], tasks: Sequence[T], workers: int) -
         initializer=_start_worker,
     )
     try:
-        for future in as_completed([pool.submit(function, task) for task in tasks]):
+        for future in [pool.submit(function, task) for task in tasks]:
             yield future.result()
     except BrokenProcessPool as error:
         raise ChildProcessError(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -83,7 +83,6 @@ class MissingPixels:
 class Completion(NamedTuple):
     """Result of a worker: NumPy arrays travel between processes as they are."""
 
-    number: int
     range_m: np.ndarray
     intensity: np.ndarray | None
     nfe: int
@@ -119,11 +118,10 @@ class CompletionJob:
         session.check(view, missing)
         return cloud, view, missing
 
-    def __call__(self, task: tuple[int, Path]) -> Completion:
-        """Complete the scan of a number and file."""
+    def __call__(self, path: Path) -> Completion:
+        """Complete the scan of a file."""
         if self.threads is not None:
             torch.set_num_threads(self.threads)
-        number, path = task
         session = _session(self.options, self.num)
         cloud, view, missing = self.read(path)
         if session.baseline is not None:
@@ -138,7 +136,7 @@ class CompletionJob:
             folder = self.options.out / _SCANS
             write_below(completed, self.root, folder / str(index) if self.num > 1 else folder)
         intensity = None if result.intensity is None else result.intensity.numpy()
-        return Completion(number, result.range_m.numpy(), intensity, result.nfe)
+        return Completion(result.range_m.numpy(), intensity, result.nfe)
 
 
 @lru_cache(maxsize=1)
@@ -167,8 +165,10 @@ def complete_files(
     with SceneWriter(
         options.out, request["num"], session.projection, (), request, options.overwrite
     ) as writer:
-        tasks = list(enumerate(paths))[writer.num_done // num :]
-        for completion in _in_order(job, tasks, workers, len(paths)):
+        done = writer.num_done // num
+        results = in_processes(job, paths[done:], workers)
+        bar = tqdm(results, total=len(paths), initial=done, unit="scan", disable=None)
+        for completion in bar:
             intensity = completion.intensity
             writer.put(
                 torch.from_numpy(completion.range_m),
@@ -192,22 +192,6 @@ def complete_files(
         nfe = writer.evaluations // writer.num
         writer.finish(request | {"nfe": nfe, "held_out": mean, "held_out_by_scan": errors})
     return _summary(len(paths), nfe, mean, options.out)
-
-
-def _in_order(
-    job: CompletionJob, tasks: Sequence[tuple[int, Path]], workers: int, total: int
-) -> Iterator[Completion]:
-    """Completions in the order of the scans, whichever worker is ready first."""
-    waiting: dict[int, Completion] = {}
-    following = iter([number for number, _ in tasks])
-    expected = next(following, None)
-    with tqdm(total=total, initial=total - len(tasks), unit="scan", disable=None) as bar:
-        for completion in in_processes(job, tasks, workers):
-            waiting[completion.number] = completion
-            bar.update()
-            while expected in waiting:
-                yield waiting.pop(expected)
-                expected = next(following, None)
 
 
 def _completed_cloud(
