@@ -149,7 +149,7 @@ def test_a_wrong_row_is_named(row, message, tmp_path):
         plan_of("demo", tables=tmp_path / "t.yaml")
 
 
-def test_tables_of_r3dpa_s_share_trainings_and_prepare_cached_images(tmp_path, monkeypatch):
+def test_tables_of_r3dpa_s_share_trainings_and_features(tmp_path, monkeypatch):
     """Six VAEs, twelve flows and three joint trainings of three seeds, after one prior."""
     monkeypatch.chdir(TABLES.parents[1])  # the scale names files of the checkout
     scale = TABLES / "scale" / "s.yaml"
@@ -162,6 +162,7 @@ def test_tables_of_r3dpa_s_share_trainings_and_prepare_cached_images(tmp_path, m
     assert kinds.pop("image_vae") == kinds.pop("rgb_pretraining") == 1
     assert kinds == {"vae_alignment": 6, "flow_matching": 12, "joint": 3}
     jobs = plan_jobs(plans[0])
-    assert jobs[0].words == ["data", "prepare", "--config", str(tmp_path / "data.yaml")]
+    data = str(tmp_path / "data.yaml")
+    assert jobs[0].words == ["features", "--data", data, "--grid_sizes", "[[8, 32]]"]
     parser = features_parser("test")  # the options of the scans fit each other
     parser.instantiate(parser.parse_args(with_data_class(["--data", f"{tmp_path}/data.yaml"])))

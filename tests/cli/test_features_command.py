@@ -201,7 +201,7 @@ def test_labelled_images_give_the_grids_that_a_training_would_make(tmp_path, cap
 
 def test_images_of_ranges_alone_are_refused(tmp_path):
     config = cached_images(tmp_path / "ranges", {"encoding": "log2", "return_channel": True})
-    with pytest.raises(ValueError, match="cached without their scans: use data prepare"):
+    with pytest.raises(ValueError, match="ranges alone are cached: give the codec a channel"):
         features("--data", config)
 
 

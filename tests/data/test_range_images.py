@@ -147,18 +147,20 @@ def test_grids_of_labelled_images_are_made_of_their_pixels_without_simulating(
             torch.testing.assert_close(grid[:, channel], expected, rtol=2e-3, atol=1e-3)
 
 
-def test_grids_of_another_extractor_are_refused_before_anything_is_added(tmp_path):
+def test_grids_of_another_extractor_are_refused(tmp_path):
     module(tmp_path, codec=LABELLED, num_scans=4, extractor=_Intensities()).prepare_data()
-    before = contents(tmp_path)
+    (grids,) = (tmp_path / "feature_grids").rglob("*.rows")
+    before = grids.read_bytes()
     other = _Intensities()
     other.settings = {"weights": "others"}
     with pytest.raises(StoreError, match="were made with extractor"):
         module(tmp_path, codec=LABELLED, num_scans=8, extractor=other).prepare_data()
-    assert contents(tmp_path) == before
+    assert grids.read_bytes() == before
 
 
-def contents(folder):
-    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+def test_ranges_alone_give_no_features(tmp_path):
+    with pytest.raises(ValueError, match="ranges alone are cached"):
+        module(tmp_path, extractor=_Intensities())
 
 
 def test_points_and_classes_of_a_labelled_image_train_a_network_on_points(tmp_path):

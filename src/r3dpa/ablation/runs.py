@@ -169,8 +169,6 @@ def plan_jobs(plan: Plan) -> list[Job]:
     of_scans = json.dumps([scans, sizes], sort_keys=True)
     of_reference = f"{of_scans} {plan.reference}"
     extract = ["features", "--data", str(data), "--grid_sizes", json.dumps(sizes)]
-    if scans["class_path"].endswith(".SimulatedImageDataModule"):
-        extract = ["data", "prepare", "--config", str(data)]
     refer = ["reference", "--data", str(data), "--out", str(reference), *plan.reference]
     jobs = [
         Job("features", extract, out / "features", of_scans),

@@ -14,7 +14,6 @@ from lightning import Trainer
 from r3dpa.cli.presets import shipped
 from r3dpa.cli.stages import StageParser, ignore_harmless_notices
 from r3dpa.data.datamodules import LidarDataModule
-from r3dpa.data.range_images import SimulatedImageDataModule
 from r3dpa.feature_names import SOURCES
 from r3dpa.features.scalr import feature_source
 from r3dpa.io import number_of
@@ -39,11 +38,6 @@ def features(args: list[str]) -> None:
         raise ValueError(
             f"no feature extractor: give --extractor, one of {', '.join(SOURCES)}, or one in the "
             "data configuration (--data.init_args.extractor)"
-        )
-    if isinstance(data, SimulatedImageDataModule) and not data.has_values:
-        raise ValueError(
-            "the ranges of this data are cached without their scans: use data prepare, or a codec "
-            "with channels of intensity or class"
         )
     extract_features(data, trainer, config.grid_sizes or [data.grid_size])
 

@@ -246,6 +246,7 @@ class LidarDataModule(LoaderModule):
             [self.grid_size],
             self.features_dir,
             workers=self.num_workers,
+            images=self.images,
         )
         rank_zero_info(f"feature grids: {num_made} made, in {self.features_dir}")
 
@@ -426,6 +427,11 @@ class SimulatedDataModule(LidarDataModule):
 
     def prepare_data(self) -> None:
         """Simulate the scans and make the feature grids that are missing."""
+        self.simulate()
+        super().prepare_data()
+
+    def simulate(self) -> None:
+        """Simulate the scans that are missing."""
         simulate(
             Path(self.root),
             scans=self.num_scans,
@@ -435,4 +441,3 @@ class SimulatedDataModule(LidarDataModule):
             effects=self.effects,
             weather=self.weather,
         )
-        super().prepare_data()

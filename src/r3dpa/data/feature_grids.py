@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from r3dpa.data.datasets import PointDataset, PointSample
+from r3dpa.data.datasets import CachedImages, PointDataset, PointSample
 from r3dpa.data.loaders import plain_loader
 from r3dpa.data.scans import Scan
 from r3dpa.data.store import CachedTensors, Store, StoreError, writing
@@ -308,6 +308,7 @@ def write_feature_grids(
     *,
     workers: int = 0,
     batch_size: int = 1,
+    images: CachedImages | None = None,
 ) -> int:
     """Make the missing grids of ``scans`` in this process.
 
@@ -322,6 +323,7 @@ def write_feature_grids(
         features_dir: Folder of the grids of this extractor.
         workers: Processes that read and prepare scans, 0 for none.
         batch_size: Scans that the extractor takes at once.
+        images: Cached images of the scans, if they are no files.
 
     Returns:
         Number of scans whose grids were made.
@@ -335,7 +337,7 @@ def write_feature_grids(
     with features_lock(features_dir):
         # Again, since another process may have made some.
         todo = plan(scans, extractor, projection, grid_sizes, features_dir)
-        dataset = PointDataset(todo.missing, projection.sensor, extractor.prepare)
+        dataset = PointDataset(todo.missing, projection.sensor, extractor.prepare, images)
         extract_grids(dataset, extractor, projection, todo.stores, workers, batch_size)
     return len(todo.missing)
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 from zlib import crc32
 
 import numpy as np
@@ -20,8 +19,6 @@ from tqdm import tqdm
 
 from lidarsim import SIMULATOR_VERSION, TRAIN_DRIVES, VAL_DRIVES, Simulator, split_scans
 from r3dpa.data.datamodules import SimulatedDataModule
-from r3dpa.data.datasets import PointDataset, PointSample
-from r3dpa.data.feature_grids import Extractor, extract_grids, plan, pooled_grids
 from r3dpa.data.loaders import at_least, plain_loader
 from r3dpa.data.store import CachedTensors, ItemKey, Store, tensor_cache
 from r3dpa.geometry import (
@@ -85,11 +82,11 @@ class CachedPixels:
 class SimulatedImageDataModule(SimulatedDataModule):
     """Simulated streets whose range images are cached in float16, 131 kB each; points are dropped.
 
-    Images are made before the first use, and so are feature grids if there is an extractor: only
-    what is missing, eight scans between two writes. A larger ``num_scans`` adds to the images of an
-    earlier run. Ranges are rounded to 11 bits, 1 cm at 20 m. Where the codec has channels of
-    intensity or class, both are cached beside the range, 197 kB each; feature grids are then made
-    of the points of the pixels, so that an extractor that comes later needs no simulation.
+    Images are made before the first use: only what is missing, eight scans between two writes. A
+    larger ``num_scans`` adds to the images of an earlier run. Ranges are rounded to 11 bits, 1 cm
+    at 20 m. Where the codec has channels of intensity or class, both are cached beside the range,
+    197 kB each. Feature grids are made of the points of these pixels, so that an extractor that
+    comes later needs no simulation.
 
     Args:
         root: Folder of the caches.
@@ -103,6 +100,11 @@ class SimulatedImageDataModule(SimulatedDataModule):
         at_least(1, every=every)
         if self.projection_kind == "rings":
             raise ValueError("projection must not be rings: the points are not kept to fit them")
+        if self.extractor is not None and not self.has_values:
+            raise ValueError(
+                "an extractor reads intensities, but ranges alone are cached: give the codec a "
+                "channel of intensity or class (--data.init_args.codec.intensity_channel true)"
+            )
         self.every = every
 
     def split(self) -> tuple[list[Any], list[Any]]:
@@ -120,27 +122,13 @@ class SimulatedImageDataModule(SimulatedDataModule):
         )
         return train, val
 
-    def prepare_data(self) -> None:
-        """Simulate what is missing, and make its feature grids."""
+    def simulate(self) -> None:
+        """Simulate the images that are missing."""
         train, val = self.limited_split()
         images: list[Any] = sorted(train + val)
-        projection = self.known_projection
-        predicting = self.trainer is not None and self.trainer.predicting
-        grids: Store | None = None
-        without_grids: Sequence[Any] = ()
         with only_writer(Path(self.root) / ".lock", f"simulates into {self.root}", wait=True):
-            missing = set(self._store.missing(images))
-            if self.features_dir is not None and self.extractor is not None and not predicting:
-                extractor = cast(Extractor, self.extractor.eval())
-                todo = plan(images, extractor, projection, [self.grid_size], self.features_dir)
-                grids, without_grids = todo.stores[self.grid_size], todo.missing
-                if not self.has_values:
-                    missing |= set(without_grids)
-            if missing:
-                made_with = None if self.has_values else grids
-                self._simulate(sorted(missing), projection, made_with)
-            if grids is not None and self.has_values:
-                self._write_grids(grids, without_grids)
+            if missing := self._store.missing(images):
+                self._simulate(missing)
 
     @cached_property
     def images(self) -> CachedPixels:
@@ -179,10 +167,7 @@ class SimulatedImageDataModule(SimulatedDataModule):
         request["classes"] = [list(semantic.labels) for semantic in SEMANTIC_CLASSES]
         return tensor_cache(Path(self.root), "labelled_image", request, (3, *shape), "uint8")
 
-    def _simulate(
-        self, items: Sequence[SimulatedImage], projection: Projection, grids: Store | None
-    ) -> None:
-        """Simulate items; write their images and, where there is a store for them, their grids."""
+    def _simulate(self, items: Sequence[SimulatedImage]) -> None:
         rank_zero_info(f"simulating {len(items)} range images into {self.root}")
         simulators = {
             drive: Simulator(
@@ -194,50 +179,29 @@ class SimulatedImageDataModule(SimulatedDataModule):
             )
             for drive in (*TRAIN_DRIVES, *VAL_DRIVES)
         }
-        extractor = cast(Extractor, self.extractor)
-        prepare = None if grids is None else extractor.prepare
-        dataset = _Simulated(items, simulators, projection, prepare, self.has_values)
+        dataset = _Simulated(items, simulators, self.known_projection, self.has_values)
         loader = plain_loader(dataset, _SCANS_PER_BATCH, self.num_workers, collate_fn=list)
-        with ExitStack() as stack:
-            images = stack.enter_context(self._store.writer())
-            grid_writer = None if grids is None else stack.enter_context(grids.writer())
+        with self._store.writer() as writer:
             for batch in tqdm(
                 loader, desc="simulate", unit_scale=_SCANS_PER_BATCH, unit="scan", disable=None
             ):
-                samples = [sample for sample, _ in batch]
-                keys = [sample.key for sample in samples]
-                images.add(keys, torch.stack([row for _, row in batch]))
-                if grid_writer is not None:
-                    pooled = pooled_grids(extractor, samples, projection, [self.grid_size])
-                    grid_writer.add(keys, pooled[self.grid_size])
-
-    def _write_grids(self, grids: Store, missing: Sequence[SimulatedImage]) -> None:
-        """Make the feature grids of cached images."""
-        if not missing:
-            return
-        rank_zero_info(f"making {len(missing)} feature grids in {grids.folder}")
-        extractor = cast(Extractor, self.extractor)
-        projection = self.known_projection
-        images = CachedPixels(CachedTensors(self._store, missing), projection)
-        dataset = PointDataset(missing, self.sensor, extractor.prepare, images)
-        stores = {self.grid_size: grids}
-        extract_grids(dataset, extractor, projection, stores, workers=self.num_workers)
+                keys, rows = zip(*batch, strict=True)
+                writer.add(keys, torch.stack(rows))
 
 
 @dataclass(eq=False, repr=False)
-class _Simulated(Dataset[tuple[PointSample, Tensor]]):
-    """Points, prepared for an extractor if there is one, and row of the cache of each scan."""
+class _Simulated(Dataset[tuple[ItemKey, Tensor]]):
+    """Key and row of the cache of each scan."""
 
     items: Sequence[SimulatedImage]
     simulators: dict[str, Simulator]
     projection: Projection
-    prepare: Callable[..., Any] | None
     with_values: bool
 
     def __len__(self) -> int:
         return len(self.items)
 
-    def __getitem__(self, index: int) -> tuple[PointSample, Tensor]:
+    def __getitem__(self, index: int) -> tuple[ItemKey, Tensor]:
         item = self.items[index]
         scan = self.simulators[item.drive].scan(item.number)
         points, labels = torch.from_numpy(scan.points), torch.from_numpy(np.int64(scan.labels))
@@ -245,8 +209,7 @@ class _Simulated(Dataset[tuple[PointSample, Tensor]]):
         row = pixels.range_m
         if self.with_values:
             row = encode_pixels(pixels, self.projection.sensor.range_max_m)
-        prepared = None if self.prepare is None else self.prepare(points)
-        return PointSample(cast(Any, item), item.cache_key, points, prepared), row
+        return item.cache_key, row
 
 
 def encode_pixels(pixels: Pixels, range_max_m: float) -> Tensor:
