@@ -41,7 +41,7 @@ def inpaint(
     left; 180 is behind.
 
     Args:
-        scan: Scan to edit: ``.bin``, ``.ply``, or ``.npz`` of one scan.
+        scan: Scan to edit: .bin, .pcd, .ply, .npy, .npz or .las.
         box: Azimuth from and to (leftwards), inclination from and to: degrees, ``-10 10 -20 0``.
         box3d: Centre x y z, length, width, height (metres, frame of the sensor), yaw (degrees). An
             object is moved into the box where it is drawn in front of it.
@@ -150,7 +150,7 @@ def mix(
     and grows to the left; 180 is behind.
 
     Args:
-        left: Scan of the left half: ``.bin``, ``.ply``, or ``.npz`` of one scan.
+        left: Scan of the left half: .bin, .pcd, .ply, .npy, .npz or .las.
         right: Scan of the right half.
         split: Azimuth in degrees where the left half starts; it ends half a turn further.
         blend: Width of the seams in degrees.
@@ -212,7 +212,7 @@ def complete(
     ignores all. ``--formats`` is ignored.
 
     Args:
-        scan: Scan or folder of scans to complete: .bin, .pcd.bin, .pcd, .ply, .npy, .npz.
+        scan: Scan or folder of scans to complete: .bin, .pcd, .ply, .npy, .npz or .las.
         sector: Azimuth from and to, counted to the left, degrees.
         keep_every: Keep every n-th beam and fill the rest: 2 upsamples 32 beams to 64.
         empty_beams: Fill what the beams do not reach, as in a scan of fewer beams: rows without a
@@ -252,7 +252,7 @@ def vary(*, scan: Path, start: float = 0.5, num: PositiveInt = 8, **options: Any
     """Generate scenes like a scan: part of the way to noise and back.
 
     Args:
-        scan: Scan to vary: ``.bin``, ``.ply``, or ``.npz`` of one scan.
+        scan: Scan to vary: .bin, .pcd, .ply, .npy, .npz or .las.
         start: Time of the noise, in (0, 1]; larger values differ more from the scan.
         num: Number of results, one per seed index.
         **options: See :class:`EditOptions`.
@@ -270,7 +270,7 @@ def interpolate(*, left: Path, right: Path, frames: int = 8, **options: Any) -> 
     """Generate scenes on the way from one scan to another, through noise.
 
     Args:
-        left: Scan of the first frame: ``.bin``, ``.ply``, or ``.npz`` of one scan.
+        left: Scan of the first frame: .bin, .pcd, .ply, .npy, .npz or .las.
         right: Scan of the last frame.
         frames: Number of scenes, both ends included.
         **options: See :class:`EditOptions`.

@@ -182,7 +182,7 @@ def realism(
     """Compare scans with real ones, each measure beside the distance between real drives.
 
     Args:
-        scans: Folder of ``.bin`` scans (A); one drive per folder.
+        scans: Folder of scans (A), .bin, .pcd, .ply, .npy, .npz or .las; one drive per folder.
         reference: Folder of real scans (B); a single drive gives no floor.
         columns: Columns of files without names, such as ``x,y,z,intensity,ring``; default:
             inferred from the values.
