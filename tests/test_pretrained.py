@@ -13,8 +13,9 @@ from tiny_labelled import labelled_checkpoint
 from tiny_networks import tiny_checkpoint, tiny_networks
 
 from r3dpa import SceneGenerator, SceneVAE, pretrained
-from r3dpa.checkpoints import convert, load_into, read_checkpoint, save_checkpoint
+from r3dpa.checkpoints import NetworkState, convert, load_into, read_checkpoint, save_checkpoint
 from r3dpa.cli import main
+from r3dpa.nn import VAE
 from r3dpa.scene_files.generated import written
 
 
@@ -124,6 +125,30 @@ def test_a_decoder_that_was_trained_on_takes_the_place_of_the_first(tmp_path):
     assert others == {key for key in before if key.startswith("vae.decoder.")}
     with pytest.raises(ValueError, match=r"encoder\.safetensors has another encoder than"):
         convert(first, out, decoder=changed("quant_conv.", "encoder.safetensors"), overwrite=True)
+
+
+def test_decoders_are_averaged_by_their_share(tmp_path):
+    first = labelled_checkpoint(tmp_path, encode_further=False)
+    content = read_checkpoint(first)
+    state = content.network("vae")
+    raised = {k: v + 0.5 if k.startswith("decoder.") else v for k, v in state.state_dict.items()}
+    networks = {"vae": replace(state, state_dict=raised)}
+    other = save_checkpoint(replace(content, networks=networks), tmp_path / "other.safetensors")
+    out = tmp_path / "out.safetensors"
+    convert(first, out, decoder=other, decoder_share=0.25)
+    before, after = load_file(first), load_file(out)
+    for key, value in before.items():
+        expected = value + 0.125 if key.startswith("vae.decoder.") else value
+        torch.testing.assert_close(after[key], expected, rtol=0, atol=1e-6)
+    with pytest.raises(ValueError, match="decoder_share must be above 0 and at most 1, got 0"):
+        convert(first, out, decoder=other, decoder_share=0.0, overwrite=True)
+    arguments = dict(state.arguments) | {"intensity": False, "num_classes": 0}
+    fewer = VAE(**arguments)
+    fewer.load_state_dict(state.state_dict, strict=False)
+    networks = {"vae": NetworkState.of(fewer, arguments)}
+    other = save_checkpoint(replace(content, networks=networks), tmp_path / "fewer.safetensors")
+    with pytest.raises(ValueError, match="have other layers, so that their weights have no mean"):
+        convert(first, out, decoder=other, decoder_share=0.5, overwrite=True)
 
 
 @pytest.mark.parametrize("stage", ["flow_matching", "few_step"])

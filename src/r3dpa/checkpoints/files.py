@@ -159,6 +159,7 @@ def convert(
     networks: Sequence[str] | None = None,
     half: bool = False,
     decoder: str | Path | None = None,
+    decoder_share: float = 1.0,
     flow: str | Path | None = None,
 ) -> str:
     """Convert a checkpoint of any layout to ours, or to the official one.
@@ -173,14 +174,14 @@ def convert(
 
     Raises:
         ValueError: If a network has no counterpart in the other layout, a file exists, the VAE of
-            ``decoder`` or ``flow`` has other latents, or the flow another shape.
+            ``decoder`` or ``flow`` has other latents, or decoder or flow another shape.
     """
     source, out = Path(source), Path(out)
     checkpoint = read_checkpoint(source, sit_args=sit_args, encoding=encoding)
     if flow is not None:
         checkpoint = _with_flow_of(checkpoint, read_checkpoint(flow))
     if decoder is not None:
-        checkpoint = _with_decoder_of(checkpoint, read_checkpoint(decoder))
+        checkpoint = _with_decoder_of(checkpoint, read_checkpoint(decoder), decoder_share)
     if networks is not None or half:
         checkpoint = replace(checkpoint, networks=_select_networks(checkpoint, networks, half))
     left_out = dict(checkpoint.left_out)
@@ -248,14 +249,39 @@ def _select_networks(
     return chosen
 
 
-def _with_decoder_of(checkpoint: Checkpoint, other: Checkpoint) -> Checkpoint:
-    """Checkpoint with the VAE of ``other``, whose encoder must be its own, and its codec."""
+def _with_decoder_of(checkpoint: Checkpoint, other: Checkpoint, share: float) -> Checkpoint:
+    """Checkpoint with the VAE of ``other``, whose encoder must be its own, and its codec.
+
+    Where ``share`` is below 1, the weights of the decoder are means of both, see WiSE-FT (Wortsman
+    et al., "Robust fine-tuning of zero-shot models", CVPR 2022).
+    """
     _check_same_latents(checkpoint, other)
     geometry = checkpoint.geometry
     if geometry is not None and other.geometry is not None:
         geometry = {**geometry, "codec": other.geometry["codec"]}
-    networks = {**checkpoint.networks, "vae": other.network("vae")}
-    return replace(checkpoint, networks=networks, geometry=geometry)
+    vae = other.network("vae")
+    if share != 1:
+        vae = _mean_of(checkpoint.network("vae"), vae, share, checkpoint.path, other.path)
+    return replace(checkpoint, networks={**checkpoint.networks, "vae": vae}, geometry=geometry)
+
+
+def _mean_of(
+    first: NetworkState, second: NetworkState, share: float, path: Path, other: Path
+) -> NetworkState:
+    """Weights ``(1 - share) * first + share * second``, in float32."""
+    if not 0 < share <= 1:
+        raise ValueError(f"decoder_share must be above 0 and at most 1, got {share:g}")
+    shapes = [{k: v.shape for k, v in net.state_dict.items()} for net in (first, second)]
+    if shapes[0] != shapes[1]:
+        raise ValueError(
+            f"the decoders of {path} and {other} have other layers, so that their weights have no "
+            "mean: leave decoder_share out"
+        )
+    weights = {
+        key: torch.lerp(value.float(), second.state_dict[key].float(), share)
+        for key, value in first.state_dict.items()
+    }
+    return replace(second, state_dict=weights)
 
 
 def _with_flow_of(checkpoint: Checkpoint, other: Checkpoint) -> Checkpoint:

@@ -19,6 +19,7 @@ def convert(
     networks: list[str] | None = None,
     half: bool = False,
     decoder: Path | None = None,
+    decoder_share: float = 1.0,
     flow: Path | None = None,
 ) -> str:
     """Convert official checkpoints into ours, or ours into official ones.
@@ -36,6 +37,8 @@ def convert(
         half: Write weights in float16, half as large.
         decoder: Checkpoint whose VAE replaces the VAE of ``ckpt``. Both must have the same encoder,
             as after ``train_encoder: false``.
+        decoder_share: Share of that decoder in a mean of the weights of both, above 0; 1 takes it
+            as it is.
         flow: Checkpoint whose flow, with its latent statistics, replaces the flow of ``ckpt``; the
             few steps of ``ckpt`` stay. Both must have the same encoder.
     """
@@ -51,6 +54,7 @@ def convert(
         networks=networks,
         half=half,
         decoder=decoder,
+        decoder_share=decoder_share,
         flow=flow,
     )
 
