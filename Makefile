@@ -181,16 +181,22 @@ r3dpa-s: $(READY) ## train the second edition of r3dpa-s: 20 hours of a core; st
 	$(BIN)/r3dpa data objects --data conf/r3dpa_s_2/data.yaml --ckpt $(SECOND)/r3dpa-s.safetensors \
 		--out $(SECOND)/r3dpa-s.objects
 
-r3dpa-s-more: $(READY) ## train weights on, in seven hours of a core: labels, alignment, few steps [FROM=r3dpa-s]
+r3dpa-s-more: $(READY) ## train weights on, in six hours of a core: labels, alignment, few steps [FROM=r3dpa-s]
 	OMP_NUM_THREADS=1 nice -n 19 $(BIN)/r3dpa data prepare $(SECOND_ALIGNED)
 	$(FIT_SECOND) $(SECOND_DATA) --config conf/r3dpa_s_2/vae_alignment.yaml \
 		--config conf/r3dpa_s_2/decoder_labels.yaml --run_dir $(SECOND)/labels \
 		--model.init_args.init_from '$(FROM)'
+	$(FIT_SECOND) $(SECOND_DATA) --config conf/r3dpa_s_2/vae_alignment.yaml \
+		--config conf/r3dpa_s_2/decoder_labels.yaml --config conf/r3dpa_s_2/perceptual.yaml \
+		--run_dir $(SECOND)/perceptual \
+		--model.init_args.init_from $(SECOND)/labels/checkpoints/last.ckpt
+	$(BIN)/r3dpa convert $(SECOND)/labels/checkpoints/last.ckpt $(SECOND)/decoder.safetensors --overwrite \
+		--decoder $(SECOND)/perceptual/checkpoints/last.ckpt --decoder_share 0.3
 	$(FIT_SECOND) $(SECOND_ALIGNED) --config conf/r3dpa_s_2/flow_matching.yaml \
 		--config conf/r3dpa_s_2/aligned.yaml --run_dir $(SECOND)/aligned \
-		--model.init_args.init_from $(SECOND)/labels/checkpoints/last.ckpt
+		--model.init_args.init_from $(SECOND)/decoder.safetensors
 	$(BIN)/r3dpa convert '$(FROM)' $(SECOND)/with_few_steps.safetensors --overwrite \
-		--flow $(SECOND)/aligned/checkpoints/last.ckpt --decoder $(SECOND)/labels/checkpoints/last.ckpt
+		--flow $(SECOND)/aligned/checkpoints/last.ckpt --decoder $(SECOND)/decoder.safetensors
 	$(FIT_SECOND) $(SECOND_ALIGNED) --config conf/r3dpa_s_2/flow_matching.yaml \
 		--config conf/r3dpa_s_2/few_step.yaml --model.init_args.vae.init_args.encode_further false \
 		--run_dir $(SECOND)/aligned_few_step --model.init_args.init_from $(SECOND)/with_few_steps.safetensors
