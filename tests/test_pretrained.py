@@ -140,6 +140,8 @@ def test_decoders_are_averaged_by_their_share(tmp_path):
     for key, value in before.items():
         expected = value + 0.125 if key.startswith("vae.decoder.") else value
         torch.testing.assert_close(after[key], expected, rtol=0, atol=1e-6)
+    with pytest.raises(ValueError, match=r"decoder_share 0\.5 needs a decoder"):
+        convert(first, out, decoder_share=0.5, overwrite=True)
     with pytest.raises(ValueError, match="decoder_share must be above 0 and at most 1, got 0"):
         convert(first, out, decoder=other, decoder_share=0.0, overwrite=True)
     arguments = dict(state.arguments) | {"intensity": False, "num_classes": 0}

@@ -176,6 +176,8 @@ def convert(
         ValueError: If a network has no counterpart in the other layout, a file exists, the VAE of
             ``decoder`` or ``flow`` has other latents, or decoder or flow another shape.
     """
+    if decoder is None and decoder_share != 1:
+        raise ValueError(f"decoder_share {decoder_share:g} needs a decoder to average with")
     source, out = Path(source), Path(out)
     checkpoint = read_checkpoint(source, sit_args=sit_args, encoding=encoding)
     if flow is not None:
