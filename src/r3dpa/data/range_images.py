@@ -103,7 +103,8 @@ class SimulatedImageDataModule(SimulatedDataModule):
         if self.extractor is not None and not self.has_values:
             raise ValueError(
                 "an extractor reads intensities, but ranges alone are cached: give the codec a "
-                "channel of intensity or class (--data.init_args.codec.intensity_channel true)"
+                "channel of intensity or class (--data.init_args.codec.intensity_channel true), or "
+                "keep the scans (r3dpa.data.SimulatedDataModule)"
             )
         self.every = every
 
