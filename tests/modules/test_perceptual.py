@@ -1,4 +1,4 @@
-"""Perceptual loss: its value by the package's own pooling, and its gradient."""
+"""Perceptual loss: its value, cell by cell, and its gradient."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from r3dpa.geometry import (
     ScanGeometry,
     SphericalProjection,
     points_of,
-    pool_cells,
 )
 from r3dpa.modules.perceptual import PerceptualLoss
 
@@ -32,8 +31,9 @@ def images(seed, num=1):
     return CODEC.to_image(range_m, intensity)
 
 
-def test_value_is_that_of_tokens_pooled_on_the_grid():
+def test_value_is_that_of_the_mean_tokens_of_cells_and_scan():
     made, scan = images(0), images(1)
+    made[:, 1, 8:, 32:64] = -1.0  # no return in the sixth cell, which does not count
     network = WaffleIronS2()
     means, totals = [], []
     for image in (made, scan):
@@ -41,10 +41,13 @@ def test_value_is_that_of_tokens_pooled_on_the_grid():
         points = points_of(pixels.range_m, GEOMETRY.projection, intensity=pixels.intensity)
         prepared = network.prepare(points)
         tokens = network.tokens(collate_scans([prepared]))
-        kept = points[prepared.kept, :3]
-        means.append(pool_cells(kept, tokens, GEOMETRY.projection, (2, 4))[0])
+        row, column = GEOMETRY.projection.pixel_of(points[prepared.kept, :3])
+        cells = row // 8 * 4 + column // 32
+        means.append(torch.stack([tokens[cells == cell].mean(dim=0) for cell in range(8)]))
         totals.append(tokens.mean(dim=0))
-    expected = (means[0] - means[1]).square().sum(dim=1).mean()
+    distances = (means[0] - means[1]).square().sum(dim=1)
+    assert distances.isnan().nonzero().flatten().tolist() == [5]
+    expected = distances.nanmean()
     expected += 10 * (totals[0] - totals[1]).square().sum()
     assert expected > 1
     loss = PerceptualLoss(GEOMETRY)(made, scan)

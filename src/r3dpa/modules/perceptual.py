@@ -9,9 +9,8 @@ import torch
 from torch import Tensor
 
 from r3dpa.features import WaffleIronS2, collate_scans
-from r3dpa.geometry import ScanGeometry, unproject
+from r3dpa.geometry import ScanGeometry, pool_cells, unproject
 
-_CELL = (8, 32)  # rows and columns of pixels
 _NUM_SCANS = 3  # of a batch, the first ones: each takes as long as a third of a training step of 8
 _MEAN_WEIGHT = 10.0  # of the mean over a scan, to which errors of single cells add little
 
@@ -19,9 +18,9 @@ _MEAN_WEIGHT = 10.0  # of the mean over a scan, to which errors of single cells 
 class PerceptualLoss:
     """Squared distance between the tokens of ``waffleiron-s-2`` of reconstructions and of scans.
 
-    Tokens are standardised and averaged over cells of 8 x 32 pixels. Ten times the squared distance
-    of their means over the scan comes on top. A decoder cannot know each leaf, but it can learn
-    what leaves look like.
+    Tokens are standardised and averaged over the cells of the feature grid. Ten times the squared
+    distance of their means over the scan comes on top. A decoder cannot know each leaf, but it can
+    learn what leaves look like.
 
     Coordinates and intensity have a gradient. Which points the network keeps, their neighbours and
     their places on its planes follow the reconstruction without one.
@@ -36,11 +35,6 @@ class PerceptualLoss:
     def __init__(self, geometry: ScanGeometry) -> None:
         self.geometry = geometry
         self.network = WaffleIronS2()
-        sensor = geometry.projection.sensor
-        rows, columns = torch.arange(sensor.beams), torch.arange(sensor.columns)
-        num_columns = -(-sensor.columns // _CELL[1])
-        self.cell_of = rows[:, None] // _CELL[0] * num_columns + columns // _CELL[1]
-        self.num_cells = int(self.cell_of.max()) + 1
 
     def __call__(self, reconstruction: Tensor, image: Tensor) -> Tensor:
         """Mean over the first scans of images ``(B, C, H, W)``; 0 where one has no points."""
@@ -49,21 +43,19 @@ class PerceptualLoss:
 
     def _distance(self, image: Tensor, scan: Tensor) -> Tensor:
         """Distance of two images ``(C, H, W)``, with gradient to the first."""
-        sums, counts = self._cell_sums(image)
+        means, counts = self._cell_means(image)
         with torch.no_grad():
-            target_sums, target_counts = self._cell_sums(scan)
+            targets, target_counts = self._cell_means(scan)
         both = (counts > 0) & (target_counts > 0)
         if not both.any():
             return image.sum() * 0
-        means = sums[both] / counts[both, None]
-        targets = target_sums[both] / target_counts[both, None]
-        mean = sums.sum(dim=0) / counts.sum()
-        target = target_sums.sum(dim=0) / target_counts.sum()
-        cells = (means - targets).square().sum(dim=1).mean()
+        cells = (means - targets)[both].square().sum(dim=1).mean()
+        mean = counts.to(means) @ means / counts.sum()
+        target = target_counts.to(targets) @ targets / target_counts.sum()
         return cells + _MEAN_WEIGHT * (mean - target).square().sum()
 
-    def _cell_sums(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Sums ``(cells, F)`` of the tokens of an image ``(C, H, W)``, and points ``(cells,)``."""
+    def _cell_means(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """Means ``(cells, F)`` of the tokens of an image ``(C, H, W)``, and points ``(cells,)``."""
         network = self.network.to(image.device)
         projection = self.geometry.projection
         pixels = self.geometry.codec.pixels_of(image, projection.sensor)
@@ -80,9 +72,5 @@ class PerceptualLoss:
         distance = points.norm(dim=1)
         features = torch.stack([standard, *points.unbind(dim=1), distance], dim=1)
         batch = collate_scans([scan]).to(image.device)._replace(features=features)
-        cells = self.cell_of.to(image.device)[returns][kept]
-        sums = points.new_zeros(self.num_cells, network.network.width)
-        counts = torch.bincount(cells, minlength=self.num_cells)
-        if len(kept):
-            sums = sums.index_add(0, cells, network.tokens(batch))
-        return sums, counts
+        tokens = network.tokens(batch) if len(kept) else points.new_zeros(0, network.network.width)
+        return pool_cells(points.detach(), tokens, projection, self.geometry.grid_size)
