@@ -198,6 +198,16 @@ def _npy_array(path: Path) -> NDArray:
     return np.array(np.lib.format.open_memmap(path, mode="r"))
 
 
+def organised_points(path: Path) -> NDArray | None:
+    """Return the array ``(H, W, C)`` of a NumPy file; None if its points are in rows."""
+    suffix = path.suffix.lower()
+    if suffix not in (".npy", ".npz"):
+        return None
+    arrays = dict(npz_arrays(path)) if suffix == ".npz" else {"": _npy_array(path)}
+    points = arrays[_main_array(arrays)]
+    return points if points.ndim == 3 else None
+
+
 def is_one_cloud(path: Path) -> bool:
     """Return whether a ``.npz`` holds points and columns of one scan, not scans by name."""
     with suppress(zipfile.BadZipFile, OSError), zipfile.ZipFile(path) as archive:
@@ -210,6 +220,11 @@ def _name_of_points(names: Collection[str]) -> str:
     if {"x", "y", "z"}.issubset(names):
         return "x"
     return next((name for name in ("xyz", "points") if name in names), "")
+
+
+def _main_array(arrays: Mapping[str, NDArray]) -> str:
+    """Return the name of the only array, or of the points; empty if there are none."""
+    return next(iter(arrays)) if len(arrays) == 1 else _name_of_points(arrays)
 
 
 def _read_numpy(path: Path, data: bytes, columns: tuple[str, ...]) -> Stored:
@@ -251,7 +266,7 @@ def _point_arrays(
     path: Path, arrays: Mapping[str, NDArray], columns: tuple[str, ...]
 ) -> tuple[tuple[int, ...], dict[str, dict[str, NDArray]]]:
     """Return the shape of one value per point, and by array the columns that it holds."""
-    main = next(iter(arrays)) if len(arrays) == 1 else _name_of_points(arrays)
+    main = _main_array(arrays)
     if main not in arrays:
         names = ", ".join(arrays) or "none"
         raise ScanError(

@@ -110,7 +110,8 @@ def test_noise_and_drops_are_withstood(vlp16_scans):
     assert estimated.dropped_share == pytest.approx(1 / 3, abs=0.05)
 
 
-def test_organised_arrays_give_offsets_from_the_column_and_the_direction():
+@pytest.mark.parametrize("name", [None, "scan.npy", "scan.npz"])
+def test_organised_arrays_give_offsets_from_the_column_and_the_direction(name, tmp_path):
     columns, distance_m = 360, 20.0
     inclination = np.radians([4.0, 1.0, -3.0, -6.0])
     offset = np.radians([-5.0, 5.0, -2.0, 2.0])
@@ -120,7 +121,12 @@ def test_organised_arrays_give_offsets_from_the_column_and_the_direction():
         [away * np.cos(azimuth), away * np.sin(azimuth), away * np.tan(inclination)[:, None]], -1
     )
     xyz[1, 10:20] = 0
-    estimated = estimate([xyz])
+    scan = xyz if name is None else tmp_path / name
+    if name == "scan.npy":
+        np.save(scan, xyz)
+    elif name == "scan.npz":
+        np.savez(scan, cloud=xyz)
+    estimated = estimate([scan])
     assert estimated.direction == "clockwise"
     assert estimated.sensor.shots == columns
     lasers = estimated.sensor.lasers

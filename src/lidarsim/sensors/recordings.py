@@ -12,7 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarsim.clouds import PointCloud, check_metres, read_cloud, suffix_of
+from lidarsim.cloud_formats import organised_points
+from lidarsim.clouds import PointCloud, check_metres, read_cloud
 from lidarsim.recorded import RecordedScan
 from lidarsim.rings import Rings, rings_of
 from lidarsim.scan_files import ScanError
@@ -59,7 +60,7 @@ def read_scan_of(scan: Any, number: int) -> SensorScan:
         name = cloud.where if cloud.file is not None else name
     elif isinstance(scan, (str, Path)):
         name, cloud = str(scan), read_cloud(scan, drop_nan=True, with_labels=False)
-        organised = _organised_file(Path(scan))
+        organised = organised_points(Path(scan))
         if organised is not None:
             shape, column = organised.shape, _returns(organised)[1]
     else:
@@ -89,17 +90,6 @@ def _check_upright(name: str, points: NDArray) -> None:
                 f"{name}: the scan is flattest along {axis}: turn the points so that z points up, "
                 "x forward and y left"
             )
-
-
-def _organised_file(path: Path) -> NDArray | None:
-    """Array ``(H, W, C)`` of a NumPy file; None if its points are in rows."""
-    if suffix_of(path) not in (".npy", ".npz"):
-        return None
-    content = np.load(path)
-    if not isinstance(content, np.ndarray):
-        names = [name for name in ("xyz", "points") if name in content.files]
-        content = content[names[0]] if names else np.zeros(0)
-    return content if content.ndim == 3 else None
 
 
 def _returns(array: NDArray) -> tuple[Indices, Indices]:
