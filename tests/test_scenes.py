@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,7 +13,7 @@ import torch
 
 from r3dpa.data import read_scan
 from r3dpa.editing import EditResult
-from r3dpa.geometry import LidarSensor, SphericalProjection, points_of
+from r3dpa.geometry import LidarSensor, Pixels, SphericalProjection, points_of
 from r3dpa.scenes import Scene, SceneBatch, scan_pixels
 
 PROJECTION = SphericalProjection(LidarSensor(beams=16, columns=64))
@@ -89,6 +90,33 @@ def test_reprs_are_one_line(labelled, edited):
 def test_an_image_in_millimetres_or_without_a_return_is_no_scan(image):
     with pytest.raises(ValueError, match=r"no return within 1\.\.56 m; ranges must be metres"):
         scan_pixels(image, PROJECTION)
+
+
+def test_scenes_that_are_no_scan_of_these_images(labelled):
+    sensor = PROJECTION.sensor
+    for wrong, message in (
+        (labelled, r"one scene, got 3: give one of them, as scenes\[0\]"),
+        (Pixels(torch.full((8, 64), 10.0)), r"must be \(16, 64\), got shape \(8, 64\)"),
+        (Scene(torch.full((16, 64), math.nan), PROJECTION), "has NaN or infinite values"),
+        (Scene(torch.full((16, 64), -1.0), PROJECTION), f"within {sensor.range_min_m:g}"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            scan_pixels(wrong, PROJECTION)
+
+
+def test_a_scene_of_another_sensor_is_read_by_its_points():
+    """Its rows look 2 degrees higher, more than a row; read as an image, ranges would stay."""
+    sensor = replace(PROJECTION.sensor, inclination_max_deg=5.0, inclination_min_deg=-23.0)
+    range_m = torch.arange(16.0)[:, None].expand(16, 64) + 10
+    labels = torch.full((16, 64), 7)
+    scene = Scene(range_m, SphericalProjection(sensor), range_m / 100, labels)
+    pixels = scan_pixels(scene, PROJECTION)
+    points = torch.cat([scene.points, scene.point_intensity[:, None]], dim=1)
+    expected = scan_pixels(points, PROJECTION, scene.point_labels)
+    for values, others in zip(pixels, expected, strict=True):
+        assert values.equal(others)
+    assert not pixels.range_m.equal(range_m)
+    assert scan_pixels(replace(scene, projection=PROJECTION), PROJECTION).range_m.equal(range_m)
 
 
 def test_a_scan_that_looks_beyond_the_field_of_view_is_warned_of(recwarn):

@@ -7,14 +7,15 @@ from typing import Self
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from r3dpa.checkpoints import Checkpoint
 from r3dpa.generation import geometry_of, open_checkpoint
-from r3dpa.geometry import ScanGeometry, project_pixels
+from r3dpa.geometry import ScanGeometry
 from r3dpa.io import usable_device
 from r3dpa.nn import VAE
-from r3dpa.scenes import SceneBatch, warn_of_points_outside_view
+from r3dpa.scenes import ScanLike, SceneBatch, scan_pixels
 
 
 class SceneVAE:
@@ -70,23 +71,20 @@ class SceneVAE:
     from_pretrained = from_checkpoint  # names of `r3dpa models`
 
     @torch.no_grad()
-    def encode(
-        self, points: Tensor | np.ndarray, labels: Tensor | np.ndarray | None = None
-    ) -> Tensor:
+    def encode(self, scan: ScanLike, labels: ArrayLike | None = None) -> Tensor:
         """Posterior means ``(1, C, h, w)`` of one scan.
 
         Args:
-            points: ``(P, 3)`` in metres, or ``(P, 4)`` with the intensity, which some VAEs need.
-            labels: ``(P,)`` KITTI-360 class in the lower 16 bits, for a VAE of classes; without,
-                it sees returns of no class, which it has hardly been trained on.
+            scan: Points ``(P, 3)`` in metres, or ``(P, 4)`` with the intensity, which some VAEs
+                need, or another :data:`r3dpa.scenes.ScanLike`.
+            labels: ``(P,)`` KITTI-360 class in the lower 16 bits, for a VAE of classes, unless the
+                scan has them; without, it sees returns of no class, which it has hardly been
+                trained on.
 
         Raises:
-            ValueError: If the points are no array of points, not finite, or all out of range.
+            ValueError: As :func:`r3dpa.scenes.scan_pixels`.
         """
-        given = self._checked_points(points)
-        warn_of_points_outside_view(given[:, :3], self.geometry.projection)
-        known = None if labels is None else torch.from_numpy(np.asarray(labels, dtype=np.int64))
-        pixels = project_pixels(given, self.geometry.projection, known)
+        pixels = scan_pixels(scan, self.geometry.projection, labels)
         codec = self.vae.codec_of_input(self.geometry.codec)
         image = codec.to_image(*pixels).to(self.device)
         return self.vae.encode(image[None]).mean
@@ -108,24 +106,3 @@ class SceneVAE:
         image = self.vae.decode(latents).float()
         pixels = self.geometry.codec.pixels_of(image, projection.sensor)
         return SceneBatch.of(pixels, latents, 0, projection)
-
-    def _checked_points(self, points: Tensor | np.ndarray) -> Tensor:
-        """Points as a tensor of float32; refuses what is no scan in metres."""
-        if not isinstance(points, Tensor | np.ndarray):
-            raise ValueError(
-                f"points must be an array or tensor (P, 3) or (P, 4), got {type(points).__name__}; "
-                "r3dpa.data.read_scan reads them from a file"
-            )
-        given = torch.as_tensor(points).float()
-        if given.ndim != 2 or given.shape[1] not in (3, 4):
-            raise ValueError(f"points must be (P, 3) or (P, 4), got shape {tuple(given.shape)}")
-        if not given.isfinite().all():
-            raise ValueError("points must be finite: leave out those with NaN or infinity")
-        sensor = self.geometry.projection.sensor
-        distance_m = given[:, :3].norm(dim=1)
-        if not ((distance_m >= sensor.range_min_m) & (distance_m <= sensor.range_max_m)).any():
-            raise ValueError(
-                f"none of {len(given)} points lies {sensor.range_min_m:g} to "
-                f"{sensor.range_max_m:g} m from the sensor; coordinates must be in metres"
-            )
-        return given

@@ -17,6 +17,7 @@ from typing import Any, Self, overload
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from lidarsim.clouds import PointCloud, read_cloud
@@ -48,58 +49,83 @@ both as tensors or NumPy arrays; the file of a scan; a :class:`Scene` or
 ``labels``, such as a simulated or recorded scan."""
 
 
-def scan_pixels(scan: ScanLike, projection: Projection) -> Pixels:
+def scan_pixels(scan: ScanLike, projection: Projection, labels: ArrayLike | None = None) -> Pixels:
     """Pixels ``(H, W)`` of a scan, on the CPU; see :func:`warn_of_points_outside_view`.
 
     Args:
         scan: See :data:`ScanLike`.
         projection: Which pixel a point belongs to.
+        labels: ``(P,)`` KITTI-360 class of each point in the lower 16 bits; default: of the scan.
 
     Raises:
         ValueError: If the scan is of another shape, has a value that is not finite, or has no point
             within the range limits.
     """
-    if isinstance(scan, Scene):
+    if isinstance(scan, SceneBatch):
+        raise ValueError(f"a scan is one scene, got {len(scan)}: give one of them, as scenes[0]")
+    if isinstance(scan, Scene) and scan.projection == projection:
         classes = None if scan.labels is None else classes_of(scan.labels.cpu())
         scan = Pixels(scan.range_m, scan.intensity, classes)
     if isinstance(scan, Pixels):
+        _check_range_image(scan.range_m, projection)
         return map_pixels(torch.Tensor.cpu, scan)
-    labels = None
-    if isinstance(scan, str | Path):
-        scan = read_cloud(scan)
-    if isinstance(scan, PointCloud):
-        labels, columns = scan.labels, 3 if scan.intensity is None else 4
-        scan = scan.rows()[:, :columns]
-    elif hasattr(scan, "points"):
-        labels = getattr(scan, "labels", None)
-        intensity = getattr(scan, "intensity", None)
-        scan = scan.points
-        if intensity is not None:
-            scan = np.column_stack([scan, np.asarray(intensity, dtype=np.float32)])
-    values = torch.as_tensor(scan).detach().cpu().float()
+    points, own_labels = _points_of_scan(scan)
+    values = torch.as_tensor(points).detach().cpu().float()
     sensor = projection.sensor
-    if not values.isfinite().all():
-        raise ValueError("the scan has NaN or infinite values; leave these points out")
     if values.shape == (sensor.beams, sensor.columns):
-        if not ((values >= sensor.range_min_m) & (values <= sensor.range_max_m)).any():
-            raise ValueError(
-                f"the range image has no return within {sensor.range_min_m:g}.."
-                f"{sensor.range_max_m:g} m; ranges must be metres"
-            )
+        _check_range_image(values, projection)
         return Pixels(values)
     if values.ndim != 2 or values.shape[1] not in (3, 4):
         raise ValueError(
             f"a scan must be points (P, 3) or (P, 4), or a range image ({sensor.beams}, "
             f"{sensor.columns}), got shape {tuple(values.shape)}"
         )
+    if not values.isfinite().all():
+        raise ValueError("the scan has NaN or infinite values; leave these points out")
     if not in_range(values[:, :3], sensor).any():
         raise ValueError(
             f"the scan has no point within {sensor.range_min_m:g}..{sensor.range_max_m:g} m; "
             "coordinates must be metres"
         )
     warn_of_points_outside_view(values[:, :3], projection)
+    labels = own_labels if labels is None else labels
     given = None if labels is None else torch.from_numpy(np.asarray(labels, dtype=np.int64))
     return project_pixels(values, projection, given)
+
+
+def _points_of_scan(scan: ScanLike) -> tuple[Any, ArrayLike | None]:
+    """Points with their intensity, where it is known, or what else was given; and labels."""
+    if isinstance(scan, str | Path):
+        scan = read_cloud(scan)
+    if isinstance(scan, PointCloud):
+        return scan.rows()[:, : 3 if scan.intensity is None else 4], scan.labels
+    if isinstance(scan, Scene):
+        intensity = None if scan.intensity is None else scan.point_intensity
+        labels = None if scan.labels is None else scan.point_labels
+    elif hasattr(scan, "points"):
+        intensity, labels = getattr(scan, "intensity", None), getattr(scan, "labels", None)
+    else:
+        return scan, None
+    if intensity is None:
+        return scan.points, labels
+    return np.column_stack([scan.points, np.asarray(intensity, dtype=np.float32)]), labels
+
+
+def _check_range_image(range_m: Tensor, projection: Projection) -> None:
+    """Refuse images of another size, and without a return within the limits of the sensor."""
+    sensor = projection.sensor
+    if range_m.shape != (sensor.beams, sensor.columns):
+        raise ValueError(
+            f"a range image must be ({sensor.beams}, {sensor.columns}), "
+            f"got shape {tuple(range_m.shape)}"
+        )
+    if not range_m.isfinite().all():
+        raise ValueError("the range image has NaN or infinite values; leave these pixels empty")
+    if not ((range_m >= sensor.range_min_m) & (range_m <= sensor.range_max_m)).any():
+        raise ValueError(
+            f"the range image has no return within {sensor.range_min_m:g}.."
+            f"{sensor.range_max_m:g} m; ranges must be metres"
+        )
 
 
 def warn_of_points_outside_view(points: Tensor, projection: Projection) -> None:
@@ -336,9 +362,10 @@ class SceneBatch:
 
         from r3dpa.viz import range_image_picture
 
-        rows = [range_image_picture(scene.range_m, self.projection.sensor) for scene in self]
+        sensor = self.projection.sensor
+        rows = [range_image_picture(scene.range_m, sensor) for scene in self[:_PICTURES]]
         border = np.full((4, *rows[0].shape[1:]), 255, np.uint8)
-        stacked = [part for row in rows[:_PICTURES] for part in (row, border)][:-1]
+        stacked = [part for row in rows for part in (row, border)][:-1]
         stream = io.BytesIO()
         Image.fromarray(np.concatenate(stacked)).save(stream, format="PNG")
         return stream.getvalue()
