@@ -40,7 +40,7 @@ def las_of(columns: Mapping[str, NDArray], suffix: str) -> bytes:
 
     ``time_s`` becomes the GPS time; columns that LAS does not know become extra dimensions.
     """
-    header = laspy.LasHeader(point_format=3, version="1.4")
+    header = laspy.LasHeader(point_format=7, version="1.4")  # classes up to 255
     header.scales = np.full(3, _STEP_M)
     header.offsets = np.floor([columns[axis].min() for axis in "xyz"])
     known = {*"xyz", *header.point_format.dimension_names}

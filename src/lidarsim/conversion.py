@@ -29,8 +29,9 @@ def convert(
 ) -> str:
     """Write scans in another format, with the labels beside them.
 
-    ``bin`` holds intensities of 0 to 1, as every command reads them, ``pcd.bin`` intensities up to
-    255 and the ring. Other formats keep units and all columns. ``las`` needs the package laspy.
+    ``bin`` and ``npy`` hold intensities of 0 to 1, as every command reads them, ``pcd.bin``
+    intensities up to 255 and the ring. Other formats keep all columns, with their units, but for
+    the intensity of ``las`` and ``laz``, in 16 bits. These two need the package laspy.
 
     Args:
         source: Scan, or folder of scans of any format that can be read; or a ROS bag or MCAP file.
@@ -43,15 +44,20 @@ def convert(
         topic: Topic of the scans of a bag; needed if several hold some.
 
     Raises:
-        ScanError: If a scan cannot be read or written, or its file exists.
+        ScanError: If a scan cannot be read or written, or its file exists, or one of other labels.
+        ValueError: If the format is unknown, or an option is not for this source.
     """
     suffix = suffix_of(out) if to is None else f".{to}"
     if suffix not in WRITERS:
         choices = ", ".join(name.removeprefix(".") for name in WRITERS)
         raise ValueError(f"{out}: unknown format {suffix!r}; choose --to from {choices}")
     if is_bag(source):
+        if columns:
+            raise ValueError(f"{source}: the scans of a bag have names for their columns")
         scans = ((out / f"{name}{suffix}", cloud) for name, cloud in read_bag(source, topic))
     else:
+        if topic is not None:
+            raise ValueError(f"{source}: topic {topic!r} is given, but it is no bag")
         targets = _targets(source, out, suffix)
         scans = ((file, read_cloud(path, columns, drop_nan)) for file, path in targets.items())
     num_written = 0
@@ -60,7 +66,10 @@ def convert(
         content = _content(cloud, suffix, full_intensity)
         if cloud.labels is not None:
             labels = cloud.labels.astype("<u4").tobytes()
-            write_bytes(target.with_name(f"{_stem(target)}.label"), labels)
+            label_path = target.with_name(f"{_stem(target)}.label")
+            if not (label_path.exists() and label_path.read_bytes() == labels):
+                _refuse_existing(label_path)
+                write_bytes(label_path, labels)
         write_bytes(target, content)
         num_written += 1
     return f"{number_of(num_written, 'scan')} written to {out} as {suffix}"

@@ -104,6 +104,7 @@ class Fault:
     def _apply(self, scan: RecordedScan, seed: Seed) -> WeatheredScan:
         generator = generator_for(*(seed if isinstance(seed, tuple) else (seed,)), self.kind)
         points = scan.points
+        is_return = points.any(axis=1)  # drivers write (0, 0, 0) for a shot without a return
         stays = np.ones(len(scan), dtype=bool)
         labels = None if scan.labels is None else scan.labels.copy()
         if not self.amount:
@@ -120,7 +121,8 @@ class Fault:
             sector = (turns / third).astype(int) % _NUM_SECTORS
             stays = (turns - sector * third - start[sector]) % 1 >= width
         elif self.kind == "crosstalk":
-            hit = generator.choice(len(scan), round(self.amount * len(scan)), replace=False)
+            returns = np.flatnonzero(is_return)
+            hit = generator.choice(returns, round(self.amount * len(returns)), replace=False)
             points = points.copy()
             points[hit] += generator.normal(0, _CROSSTALK_M, (len(hit), 3)).astype(np.float32)
             if labels is not None:
@@ -133,6 +135,7 @@ class Fault:
             axis, way = (vector / np.linalg.norm(vector) for vector in vectors)
             turned = Rotation.from_rotvec(np.radians(self.amount) * axis).apply(points)
             points = (turned + _METRES_PER_DEGREE * self.amount * way).astype(np.float32)
+        points = np.where(is_return[:, None], points, np.float32(0))
         kept = np.flatnonzero(stays)
         lost = len(scan) - len(kept)
         moved = int((points != scan.points).any(axis=1).sum())

@@ -59,6 +59,7 @@ _INSTRUMENT = Instrument()
 # Fields of a prior, equally likely, and the deepest film of a road in rain.
 _FIELDS = ("visibility_m", "rain_mm_h", "snow_mm_h")
 _FULL_FILM_MM = 1.5
+_LONGEST_TURN_S = 1.0
 Seed = int | tuple[int | str, ...]
 Points = TypeVar("Points")  # array, tensor or cloud
 
@@ -99,8 +100,9 @@ class Weather(scene.Conditions):
     rain or snow in front of the sky would give one, since nothing is known of them.
 
     Args:
-        traffic_m_s: Speed of vehicles that have an instance in the labels, for their spray; they
-            are assumed to drive along their length, ahead rather than back.
+        traffic_m_s: Speed of vehicles that have an instance in the labels, for their spray, which
+            begins at 10 m/s and needs ``water_film_mm``; they are assumed to drive along their
+            length, ahead rather than back.
 
     Example:
         >>> points = np.random.default_rng(0).uniform(5, 40, (1000, 3)).astype(np.float32)
@@ -197,9 +199,18 @@ def recorded_scan(cloud: PointCloud) -> RecordedScan:
     """
     points = cloud.points.astype(np.float32)
     try:
-        return RecordedScan(points, cloud.intensity, cloud.ring, cloud.time_s, cloud.labels)
+        return RecordedScan(points, cloud.intensity, cloud.ring, _seconds(cloud), cloud.labels)
     except ValueError as error:
         raise ScanError(f"{cloud.where}: {error}") from error
+
+
+def _seconds(cloud: PointCloud) -> NDArray[np.float64] | None:
+    """Return times from the first point on; files have them in s, ms, us or ns."""
+    if cloud.time_s is None:
+        return None
+    elapsed = (cloud.time_s - cloud.time_s.min()).astype(float)
+    units = (1.0, 1e-3, 1e-6, 1e-9)
+    return elapsed * next((u for u in units if elapsed.max() * u <= _LONGEST_TURN_S), units[-1])
 
 
 def changed_cloud(cloud: PointCloud, result: WeatheredScan) -> PointCloud:

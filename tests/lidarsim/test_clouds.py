@@ -23,7 +23,7 @@ INTENSITY = random.integers(0, 256, NUM).astype(np.float32)
 RING = np.repeat(np.arange(4), NUM // 4)
 ROWS = np.concatenate([POINTS, INTENSITY[:, None], RING[:, None]], axis=1, dtype=np.float32)
 FIELDS = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("intensity", "f4"), ("ring", "u2"), ("t", "f8")]
-TABLE = np.array([(*row, n / 3) for n, row in enumerate(ROWS)], FIELDS)
+TABLE = np.array([(*row, n / 300) for n, row in enumerate(ROWS)], FIELDS)
 
 
 def text(table):
@@ -100,7 +100,7 @@ def test_every_format_gives_the_columns_and_is_written_again(tmp_path, name):
     if num_columns > 4:
         np.testing.assert_array_equal(scan.ring, RING)
     if num_columns == 6:
-        np.testing.assert_allclose(scan.time_s, TABLE["t"], rtol=1e-8)
+        np.testing.assert_allclose(scan.time_s, TABLE["t"] - TABLE["t"].min(), atol=1e-12)
     low, high = INTENSITY.min(), INTENSITY.max()
     assert f"40 points, range {np.linalg.norm(POINTS, axis=1).min():.3g}.." in file.describe()
     assert f"intensity {low:g}..{high:g}" in file.describe()
@@ -114,6 +114,16 @@ def test_every_format_gives_the_columns_and_is_written_again(tmp_path, name):
     half = replace(file, table=file.table[::2], file=file.file._replace(data=None))
     write_below(half, tmp_path / "in", out)
     np.testing.assert_array_equal(read_cloud(out / "a" / name).table, file.table[::2])
+
+
+@pytest.mark.parametrize(
+    ("unit", "kind"), [(1, "f4"), (1e3, "f4"), (1e6, "u4"), (1e9, "u4"), (1e9, "u8")]
+)
+def test_times_are_seconds_whatever_the_unit_of_the_file(unit, kind):
+    """A tenth of a second of points, as in a turn of most sensors."""
+    time_s = np.linspace(0, 0.1, len(POINTS))
+    cloud = PointCloud.of(POINTS, t=(time_s * unit + unit).astype(kind))
+    np.testing.assert_allclose(recorded_scan(cloud).time_s, time_s, atol=1e-6)
 
 
 NOTHING = [

@@ -107,3 +107,32 @@ def test_the_command_that_is_advised_for_nan_leaves_them_out(points, tmp_path):
     options = str(raised.value).split("`")[1].partition("SCANS OUT")[2].split()
     convert(tmp_path / "a.bin", tmp_path / "out", *options)
     assert np.array_equal(read_scan(tmp_path / "out/a.bin"), np.delete(points, 3, axis=0))
+
+
+def test_labels_of_another_file_of_that_name_stay(points, tmp_path):
+    """Without the dropped point there are fewer labels; the ones beside the source are all."""
+    rows = points.copy()
+    rows[3, 2] = np.nan
+    np.save(tmp_path / "a.npy", rows)
+    labels = np.arange(len(points), dtype="<u4").tobytes()
+    (tmp_path / "a.label").write_bytes(labels)
+    with pytest.raises(ScanError, match=r"a\.label: exists: delete it, or give another name"):
+        convert(tmp_path / "a.npy", tmp_path / "a.bin", "--drop_nan", "true")
+    assert (tmp_path / "a.label").read_bytes() == labels
+    assert not (tmp_path / "a.bin").exists()
+    np.save(tmp_path / "a.npy", points)
+    convert(tmp_path / "a.npy", tmp_path / "a.bin")
+    assert (tmp_path / "a.label").read_bytes() == labels
+
+
+def test_a_topic_is_for_bags(folder, tmp_path):
+    with pytest.raises(ValueError, match="topic '/points' is given, but it is no bag"):
+        convert(folder, tmp_path / "out", "--to", "ply", "--topic", "/points")
+
+
+def test_las_keeps_classes_above_31(points, tmp_path):
+    pytest.importorskip("laspy")
+    classes = np.arange(len(points)) % 256
+    cloud = PointCloud.of(points, classification=classes.astype("u1"))
+    write_cloud(tmp_path / "a.las", cloud)
+    assert read_cloud(tmp_path / "a.las").columns["classification"].tolist() == classes.tolist()

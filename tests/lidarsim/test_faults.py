@@ -156,3 +156,12 @@ def test_what_is_missing_or_out_of_range_is_named():
     shuffled = random.normal(0, 10, (500, 3)).astype(np.float32)
     with pytest.raises(ValueError, match="keep the order of the sensor, or store the column ring"):
         Fault("missing_beams").apply(RecordedScan(shuffled))
+
+
+@pytest.mark.parametrize("kind", ["crosstalk", "motion_blur", "shifted_extrinsics"])
+def test_shots_without_a_return_stay_at_the_origin(kind):
+    points = SCAN.points.copy()
+    points[::2] = 0
+    result = Fault(kind, severity=3).apply(RecordedScan(points))
+    assert not result.points[::2].any()
+    assert 0 < result.report["moved"] <= len(points) // 2

@@ -356,8 +356,8 @@ class Rain(_Hydrometeors):
     """Rain attenuates every echo, and a drop in the beam may outshine a weak target.
 
     Equations: :class:`_Hydrometeors`. A sphere of the refractive index n = 1.33 reflects from
-    its front and, focused, from its rear ``F / 4 (1 + (1 - F)^2 (n / (2 - n))^2) = 0.024`` of the
-    echo of a white disk, with F = 0.02. At 10 mm/h the extinction is 1.6e-3 per metre.
+    its front and, focused, from its rear ``F / 4 (1 + (1 - F)^2 (n / (2 - n))^2) = 0.024``, here
+    0.02, of the echo of a white disk, with F = 0.02. At 10 mm/h the extinction is 1.6e-3 per metre.
 
     Source: Marshall and Palmer 1948 for the sizes.
     """
