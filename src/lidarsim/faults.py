@@ -104,7 +104,7 @@ class Fault:
     def _apply(self, scan: RecordedScan, seed: Seed) -> WeatheredScan:
         generator = generator_for(*(seed if isinstance(seed, tuple) else (seed,)), self.kind)
         points = scan.points
-        is_return = points.any(axis=1)  # drivers write (0, 0, 0) for a shot without a return
+        is_return = np.any(points, axis=1)  # drivers write (0, 0, 0) for a shot without a return
         stays = np.ones(len(scan), dtype=bool)
         labels = None if scan.labels is None else scan.labels.copy()
         if not self.amount:
