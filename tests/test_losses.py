@@ -8,7 +8,7 @@ import torch.nn.functional as F
 
 from r3dpa.losses import (
     alignment_loss,
-    balanced_gradient,
+    balanced_generator_loss,
     centred_features,
     discriminator_loss,
     flow_matching_loss,
@@ -33,14 +33,17 @@ def test_generator_loss_is_minus_the_mean_logit():
 def test_a_balanced_gradient_has_a_share_of_the_length_of_that_of_l1():
     image = torch.randn(3, 1, 4, 8, generator=torch.Generator().manual_seed(0)).requires_grad_()
     (expected,) = torch.autograd.grad(reconstruction_loss(image, torch.zeros(3, 1, 4, 8)), image)
-    further = balanced_gradient(image, 0.5).square().sum() * 1e-3
+    logits = -1e-3 * image.square()
+    further = balanced_generator_loss(logits, image, 0.5)
+    assert further.item() == generator_loss(logits).item()
     (found,) = torch.autograd.grad(further, image, retain_graph=True)
     lengths = [gradient.flatten(1).norm(dim=1) for gradient in (found, expected)]
     torch.testing.assert_close(lengths[0], 0.5 * lengths[1])
     directions = torch.nn.functional.cosine_similarity(found.flatten(1), image.flatten(1))
     torch.testing.assert_close(directions, torch.ones(3))
-    (both,) = torch.autograd.grad(image.sum() + further, image)
-    torch.testing.assert_close(both, 1 + found)  # another loss keeps its gradient
+    # As of any loss: of two parts of a batch, or scaled against underflow.
+    (both,) = torch.autograd.grad(image.sum() + further / 2, image)
+    torch.testing.assert_close(both, 1 + found / 2)
 
 
 def test_discriminator_loss_vanishes_beyond_the_margins():

@@ -13,7 +13,7 @@ from torch import Tensor
 
 __all__ = [
     "alignment_loss",
-    "balanced_gradient",
+    "balanced_generator_loss",
     "centred_features",
     "class_errors",
     "discriminator_loss",
@@ -105,30 +105,30 @@ def generator_loss(fake_logits: Tensor) -> Tensor:
     return -fake_logits.float().mean()
 
 
-def balanced_gradient(image: Tensor, ratio: float) -> Tensor:
-    """Return the image with a hook that scales the gradient of a further loss.
+def balanced_generator_loss(fake_logits: Tensor, image: Tensor, ratio: float) -> Tensor:
+    """Value of :func:`generator_loss`, with a gradient of a given length.
 
-    The gradient of each sample is rescaled to ``ratio`` times the length of the gradient of an L1
-    loss. With a fixed adversarial weight it would be hundredths of the reconstruction gradient, or
-    swamp it, depending on the discriminator.
+    The gradient of each sample has ``ratio`` times the length of the gradient of an L1 loss. With a
+    fixed adversarial weight it would be hundredths of the reconstruction gradient, or swamp it,
+    depending on the discriminator.
 
     Source: as the adaptive weight of Esser et al., "Taming transformers" (CVPR 2021), per sample
     and at the image, so that results do not depend on how a batch is split.
 
     Args:
+        fake_logits: Patch logits of the images, any shape.
         image: ``(B, C, H, W)`` decoded images.
         ratio: Length relative to the gradient of the mean absolute error, ``1 / (B sqrt(C H W))``.
     """
+    loss = generator_loss(fake_logits)
+    if not image.requires_grad:
+        return loss
+    # Of the sum, since parts of a mean may be too small for half precision.
+    (gradient,) = torch.autograd.grad(-fake_logits.float().sum(), image)
+    norms = gradient.flatten(1).norm(dim=1).clamp(min=1e-30)
     length = ratio / (len(image) * image[0].numel() ** 0.5)
-    image = image.view_as(image)  # the gradients of other losses stay as they are
-
-    def scaled(gradient: Tensor) -> Tensor:
-        norms = gradient.flatten(1).norm(dim=1).clamp(min=1e-30)
-        return gradient * (length / norms)[:, None, None, None]
-
-    if image.requires_grad:
-        image.register_hook(scaled)
-    return image
+    pull = (image * gradient * (length / norms)[:, None, None, None]).sum()
+    return loss.detach() + (pull - pull.detach())
 
 
 def discriminator_loss(real_logits: Tensor, fake_logits: Tensor) -> Tensor:

@@ -288,11 +288,14 @@ class GenerativeModule(Stage):
         adversarial = weights.adversarial != 0 and self.global_step >= weights.adversarial_start
         if self.discriminator is not None and adversarial:
             scan = self.vae.scan_of(prediction)
-            if weights.adversarial_ratio is not None:
-                scan = losses.balanced_gradient(scan, weights.adversarial_ratio)
             with frozen(self.discriminator):
                 logits = self.discriminator(scan)
-            parts["adversarial"] = weights.adversarial * losses.generator_loss(logits)
+            if weights.adversarial_ratio is None:
+                parts["adversarial"] = weights.adversarial * losses.generator_loss(logits)
+            else:
+                parts["adversarial"] = losses.balanced_generator_loss(
+                    logits, scan, weights.adversarial_ratio
+                )
         if not parts.keys() & {"reconstruction", "adversarial"}:
             parts["reconstruction"] = zero_loss(self.vae)
         return parts

@@ -29,8 +29,8 @@ class LossWeights:
             and scan, see :class:`r3dpa.modules.perceptual.PerceptualLoss`.
         adversarial: Weight of the generator's adversarial loss (official 0.3 x 0.001).
         adversarial_ratio: Target ratio of adversarial to L1 gradient norm at the image (adaptive
-            weight of VQGAN). Overrides ``adversarial``. Default: fixed weight, at which the
-            discriminator dominates.
+            weight of VQGAN), in place of ``adversarial`` where that is not 0. Default: fixed
+            weight, at which the discriminator dominates.
         discriminator: Factor of the discriminator's hinge loss. AdamW is invariant to this scale;
             it only affects clipping and logs.
         adversarial_start: First step at which both adversarial losses count.
