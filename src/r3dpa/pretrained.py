@@ -126,7 +126,7 @@ def _from_hub(place: str) -> Path:
         raise ValueError(
             f"hf://{place}: downloads need huggingface_hub: pip install 'r3dpa[hub]'"
         ) from None
-    stem = Path(file).stem if file else "*"
+    stem = file.removesuffix(".safetensors") or "*"
     patterns = [file or "*.safetensors", f"{stem}.yaml", f"{stem}{OBJECTS_SUFFIX}"]
     try:
         folder = Path(snapshot_download(f"{owner}/{name}", allow_patterns=patterns))

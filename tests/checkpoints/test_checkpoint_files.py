@@ -205,6 +205,7 @@ class TestLoadInto:
             ("sit", {"alignment_depth": 3}, "alignment_depth: checkpoint 2"),
             ("sit", {"input_size": (8, 4)}, r"input_size: checkpoint \(4, 8\)"),
             ("vae", {"legacy_upsample": False}, "legacy_upsample: checkpoint True, network False"),
+            ("vae", {"least_scale": 0.01}, r"least_scale: checkpoint 0\.00\d+, network 0\.01"),
             ("latent_norm", {"eps": 1e-5}, "eps: checkpoint 0.0001, network 1e-05"),
         ],
     )

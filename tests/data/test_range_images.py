@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from importlib.resources import files
+
 import pytest
 import torch
 from torch import nn
@@ -22,6 +24,7 @@ from r3dpa.geometry import (
     range_image,
 )
 
+SENSORS = files("lidarsim.sensors") / "presets"
 SMALL = LidarSensor(beams=16, columns=64)
 CODEC = RangeCodec("log2", return_channel=True)
 LABELLED = RangeCodec("log2", return_channel=True, intensity_channel=True, num_classes=NUM_CLASSES)
@@ -69,6 +72,15 @@ def test_images_of_another_request_are_not_mixed_up(root):
     one, other = module(root), module(root, simulation_seed=1)
     keys = [{item.cache_key for part in data.split() for item in part} for data in (one, other)]
     assert not keys[0] & keys[1]
+
+
+def test_another_sensor_in_the_same_file_is_another_request(tmp_path):
+    file = tmp_path / "mine.yaml"
+    requests = []
+    for name in ("vlp16", "hdl32e", "hdl32e"):
+        file.write_text((SENSORS / f"{name}.yaml").read_text())
+        requests.append(module(tmp_path, simulation_sensor=str(file)).split()[0][0].request)
+    assert requests[0] != requests[1] == requests[2]
 
 
 def test_rings_need_points(tmp_path):

@@ -75,10 +75,18 @@ def test_without_geometry_no_target_is_computed_and_every_parameter_learns(
     module = PointSegmentation(WaffleIron(16, 3, GRID.cells), geometry_weight=0)
     trainer = Trainer(max_steps=1, num_sanity_val_steps=0, default_root_dir=tmp_path, **SILENT)
     trainer.fit(module, data)
+    assert all(buffer.isfinite().all() for buffer in module.buffers())  # else StepGuard stops it
     module.losses([data.train_set[(1, 0)]])["loss"].backward()
     assert all(p.grad is not None for p in module.parameters() if p.requires_grad)
     with pytest.raises(ValueError, match=r"geometry_weight 1 needs the targets .* geometry false"):
         trainer.fit(PointSegmentation(WaffleIron(16, 3, GRID.cells)), data)
+
+
+def test_overfit_batches_takes_the_first_scans_again_and_again(tmp_path, data):
+    module = PointSegmentation(WaffleIron(16, 3, GRID.cells))
+    trainer = Trainer(max_steps=2, overfit_batches=1, default_root_dir=tmp_path, **SILENT)
+    trainer.fit(module, data)
+    assert trainer.global_step == 2
 
 
 def test_training_learns_classes_and_goes_on_from_its_weights(tmp_path, data):

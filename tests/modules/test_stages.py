@@ -66,6 +66,13 @@ def test_flow_matching_without_latent_statistics_is_refused(smoke_args, from_pre
         main(smoke_args("flow_matching", tmp_path, *more, "--model.init_args.init_networks=[vae]"))
 
 
+def test_networks_to_start_from_that_a_stage_lacks(smoke_args, from_previous, tmp_path):
+    more = [*QUICK, *from_previous("joint")]
+    with pytest.raises(ValueError, match="names 'ema', but the networks of this stage are vae, "):
+        main(smoke_args("joint", tmp_path / "a", *more, "--model.init_args.init_networks=[ema]"))
+    main(smoke_args("joint", tmp_path / "b", *more, "--model.init_args.discriminator=null"))
+
+
 def test_a_readout_trains_the_projection_head_alone(
     smoke_args, vae_checkpoint, from_previous, tmp_path
 ):

@@ -11,9 +11,10 @@ from stage_runs import QUICK, load
 from tiny_stages import QUIET, REACH, TinyData, stage_module, train
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from lidarsim.weather import WeatherPrior
 from r3dpa.checkpoints import read_checkpoint, save_checkpoint
 from r3dpa.cli import main
-from r3dpa.data import Augmentation
+from r3dpa.data import Augmentation, LidarDataModule
 from r3dpa.modules import LossWeights, flow_matching
 from r3dpa.nn import Posterior
 
@@ -80,6 +81,16 @@ class TestCachedLatents:
         more += ["--data.init_args.augmentation.flip=true"]
         with pytest.raises(ValueError, match=r"mirroring.*--model.init_args.cache_latents false"):
             main(smoke_args("flow_matching", tmp_path, *more))
+
+    def test_weather_is_refused_before_scans_are_encoded(
+        self, smoke_args, vae_checkpoint, tmp_path, monkeypatch
+    ):
+        stormy = property(lambda _: WeatherPrior(), lambda *_: None)
+        monkeypatch.setattr(LidarDataModule, "weather_prior", stormy)
+        more = [*QUICK, "--model.init_args.init_from", str(vae_checkpoint)]
+        with pytest.raises(ValueError, match=r"weather.*--model.init_args.cache_latents false"):
+            main(smoke_args("flow_matching", tmp_path, *more))
+        assert not (tmp_path / "latents").exists()
 
 
 class TestLayout:

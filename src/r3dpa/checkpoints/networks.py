@@ -45,6 +45,7 @@ _SHAPELESS_ARGS = {
     "legacy_upsample": "legacy",
     "norm_groups": "num_groups",
     "stem": "stem",
+    "least_scale": "least_scale",
 }
 
 

@@ -272,13 +272,17 @@ class LidarDataModule(LoaderModule):
             for split in (train, val, scans)
         )
 
-    def use_posteriors(self, posteriors: CachedTensors) -> None:
-        """Train on cached posteriors ``(2C, h, w)`` of a frozen VAE."""
+    def check_posteriors(self) -> None:
+        """Refuse weather, which cached posteriors of a VAE cannot follow."""
         if self.weather_prior is not None:
             raise ValueError(
                 "weather: cached posteriors belong to the clear scans. Switch it off, or encode "
                 "in each step: --model.init_args.cache_latents false"
             )
+
+    def use_posteriors(self, posteriors: CachedTensors) -> None:
+        """Train on cached posteriors ``(2C, h, w)`` of a frozen VAE."""
+        self.check_posteriors()
         self.train_set = replace(self.train_set, posteriors=posteriors)
 
     def train_dataloader(self) -> DataLoader[Any]:

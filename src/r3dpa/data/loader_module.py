@@ -33,12 +33,14 @@ class LoaderModule(LightningDataModule):
     ) -> DataLoader[Any]:
         """Loader as :func:`training_loader`, or of all samples in order.
 
-        A training set smaller than one batch makes smaller batches, which is said on the screen.
+        In order, and as held-out ones, come training samples under ``overfit_batches`` too. A
+        training set smaller than one batch makes smaller batches, which is said on the screen.
         """
         trainer = self.trainer
         replicas, rank = (1, 0) if trainer is None else (trainer.world_size, trainer.global_rank)
         options |= worker_options(self.num_workers)
-        if not train:
+        if not train or getattr(trainer, "overfit_batches", 0) > 0:
+            options.pop("with_epoch", None)
             # Some samples come twice, so that all processes have as many batches.
             in_order: DistributedSampler[Any] = DistributedSampler(
                 dataset, replicas, rank, shuffle=False

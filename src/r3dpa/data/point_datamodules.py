@@ -48,6 +48,7 @@ class PointDataModule(LoaderModule):
                 "trained without feature grids"
             )
         self.source, self.prepare, self.weather_prior = source, prepare, weather
+        self.prepare_data_per_node = source.prepare_data_per_node
 
     def prepare_data(self) -> None:
         """Simulate the scans, where the source does."""

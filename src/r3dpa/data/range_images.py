@@ -17,7 +17,15 @@ from torch import Tensor
 from torch.utils.data import Dataset
 from tqdm import tqdm
 
-from lidarsim import SIMULATOR_VERSION, TRAIN_DRIVES, VAL_DRIVES, Simulator, split_scans
+from lidarsim import (
+    SIMULATOR_VERSION,
+    TRAIN_DRIVES,
+    VAL_DRIVES,
+    Simulator,
+    load_sensor,
+    split_scans,
+)
+from lidarsim.sensors import PRESETS
 from r3dpa.data.datamodules import SimulatedDataModule
 from r3dpa.data.loaders import at_least, plain_loader
 from r3dpa.data.store import CachedTensors, ItemKey, Store, tensor_cache
@@ -32,7 +40,7 @@ from r3dpa.geometry import (
     project_pixels,
     projection_to_dict,
 )
-from r3dpa.io import only_writer
+from r3dpa.io import json_values, only_writer
 
 _SCANS_PER_BATCH = 8  # that are simulated between two writes
 # Three bytes per pixel: 13 bits for the range, 4 for the class, 7 for the intensity.
@@ -153,11 +161,18 @@ class SimulatedImageDataModule(SimulatedDataModule):
         return self.codec.intensity_channel or self.codec.num_classes > 0
 
     @property
+    def _sensor_values(self) -> Any:
+        """Name of a preset, or what the file of a sensor says now."""
+        if self.simulation_sensor in PRESETS:
+            return self.simulation_sensor
+        return json_values(asdict(load_sensor(self.simulation_sensor)))
+
+    @property
     def _store(self) -> Store:
         request: dict[str, Any] = {
             "simulator_version": SIMULATOR_VERSION,
             "seed": self.simulation_seed,
-            "sensor": self.simulation_sensor,
+            "sensor": self._sensor_values,
             "effects": self.effects,
             "weather": None if self.weather is None else asdict(self.weather),
             "projection": projection_to_dict(self.known_projection),

@@ -122,7 +122,9 @@ class GenerativeModule(Stage):
         self.interpolant = Interpolant(path)
         self.latent_shape = (vae.latent_channels, *sit.input_size)
         self.init_from = init_from
-        self.init_networks = self.default_init if init_networks is None else tuple(init_networks)
+        if init_networks is None:
+            init_networks = [name for name in self.default_init if getattr(self, name) is not None]
+        self.init_networks = tuple(init_networks)
         self.init_other_sensor = init_other_sensor
         self.rgb_weights = rgb_weights
         self.keep_projector = keep_projector
@@ -235,7 +237,14 @@ class GenerativeModule(Stage):
         if self.init_from is not None:
             given = read_checkpoint(self.init_from)
             before = self.previous_networks(given)
-            networks = {name: self.get_submodule(name) for name in self.init_networks}
+            own = {"vae": self.vae, "sit": self.sit, "latent_norm": self.latent_norm}
+            own |= self.trainable()
+            if unknown := [name for name in self.init_networks if name not in own]:
+                raise ValueError(
+                    f"--model.init_args.init_networks names {unknown[0]!r}, but the networks of "
+                    f"this stage are {', '.join(own)}"
+                )
+            networks = {name: own[name] for name in self.init_networks}
             if self.init_other_sensor:
                 before, rows = resize_to(networks, before, given)
                 rank_zero_info(f"weights of another sensor from {self.init_from}\n{_table(rows)}")

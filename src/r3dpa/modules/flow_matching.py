@@ -97,6 +97,7 @@ class FlowMatching(GenerativeModule):
                 "model.init_args.cache_latents needs a r3dpa.data.LidarDataModule, got "
                 f"{type(datamodule).__name__}; set it to false"
             )
+        datamodule.check_posteriors()
         datamodule.augmentation.check_latents(self.sit.input_size[1], datamodule.grid_size[1])
 
     def on_fit_start(self) -> None:

@@ -45,6 +45,8 @@ class PointSegmentation(PointPretraining):
         super().__init__(network, **kwargs)
         self.geometry_weight = geometry_weight
         self.head.requires_grad_(geometry_weight > 0)  # DDP wants a gradient of every parameter
+        if not geometry_weight:
+            self.edges.zero_()  # never measured; a buffer of NaN stops a run
         self.class_head: nn.Linear = nn.Linear(network.width, NUM_CLASSES)
         if start is not None:
             state, trained, _ = read_weights(start)
