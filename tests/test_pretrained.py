@@ -47,6 +47,10 @@ def test_a_name_a_file_and_a_repository_are_taken_alike(shipped, monkeypatch):
     assert asked == [("owner/name", ["*.safetensors", "*.yaml", "*.objects"])]
     assert SceneVAE.from_pretrained("tiny", "cpu").vae.latent_channels == first.sit.in_channels
     assert read_checkpoint("hf://owner/name/tiny.safetensors").path == sources[1]
+    shutil.copytree(shipped, shipped / "v2")
+    file = "v2/tiny.safetensors"
+    assert read_checkpoint(f"hf://owner/name/{file}").path == shipped / file
+    assert asked[-1][1] == [file, "v2/tiny.yaml", "v2/tiny.objects"]
 
 
 def test_commands_use_the_weights_of_the_package(shipped, tmp_path, monkeypatch):
