@@ -124,6 +124,9 @@ def test_released_files_stand_for_trainings(tmp_path, monkeypatch):
     (stage,) = rows["table_1", "ultralidar"].stages[0]
     assert jobs[f"test of {stage.name}"].words[2] == str(samples)
     assert stage.name not in jobs
+    next(stage for stage in plan.stages if stage.on_features).config["scorer"]["num_scenes"] += 1
+    again = {job.name: job for job in plan_jobs(plan)}
+    assert again[test.name].content != test.content  # of other samples
 
 
 ROW = {"label": "x", "commands": {"a": "r3dpa fit joint"}}

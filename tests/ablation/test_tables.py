@@ -27,6 +27,17 @@ def test_a_mean_over_seeds_keeps_notes_and_bad_samples():
     assert mean_of_seeds("row", [evaluation(JSD=1.0)]).row("JSD").interval == (0.9, 1.1)
 
 
+def test_released_weights_keep_their_interval_over_scenes(tmp_path):
+    """With every seed they are the same: three seeds say no more than one."""
+    stage = PlannedStage("weights", tmp_path / "weights", [], {}, ())
+    evaluation(JSD=0.5).save(stage.evaluation)
+    row = Row("r", "released", {}, {seed: [stage] for seed in (0, 1, 2)})
+    table = Table("t", "", [row], [])
+    write_table(Plan(tmp_path, "demo", "", [], (0, 1, 2), [table]), table, {})
+    (line,) = csv.DictReader((tmp_path / "t.csv").read_text().splitlines())
+    assert (float(line["low"]), float(line["high"])) == pytest.approx((0.4, 0.6))
+
+
 @pytest.mark.parametrize(
     ("ours", "theirs", "better", "alike"),
     [

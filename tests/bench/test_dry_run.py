@@ -38,6 +38,14 @@ def test_a_dry_run_of_checkpoints(smoke_args, tmp_path, vae_checkpoint, capsys):
     assert megabytes == pytest.approx(vae_checkpoint.stat().st_size / 1e6, rel=0.05)
 
 
+def test_a_dry_run_counts_checkpoints_that_all_stay(smoke_args, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(DryRun, "_measure", lambda *_: StageCost("joint", step_seconds=[1.0]))
+    words = smoke_args("joint", tmp_path / "run", "--trainer.max_steps=9")
+    words += ["--checkpoint.save_top_k=-1", "--checkpoint.every_n_train_steps=4"]
+    main([*words, "--dry_run"])
+    assert "disk: 3 checkpoints of" in capsys.readouterr().out
+
+
 def test_a_dry_run_knows_the_size_of_images_before_they_exist(smoke_args, tmp_path, capsys):
     words = smoke_args("vae_alignment", tmp_path / "run")
     words += ["--data=r3dpa.data.SimulatedImageDataModule"]

@@ -342,6 +342,13 @@ class TestView:
         assert [row[:2] for row in page["categories"]["semantic"]] == [[int(Semantic.CAR), "car"]]
         assert [row[:2] for row in page["categories"]["origin"]] == [[int(Origin.RAIN), "rain"]]
 
+    def test_labels_of_semantic_kitti_are_shown(self, tmp_path):
+        write_bin(tmp_path / "velodyne" / "0.bin", points())
+        (tmp_path / "labels").mkdir()
+        (tmp_path / "labels" / "0.label").write_bytes(np.full(200, 10, "<u4").tobytes())  # cars
+        _, page, _ = self.show(tmp_path, tmp_path / "out")
+        assert [row[1] for row in page["categories"]["semantic"]] == ["car"]
+
     def test_labels_of_another_number_than_the_points_are_refused(self, drive, tmp_path):
         (drive / "labels/0000000004.label").write_bytes(bytes(798))
         with pytest.raises(ValueError, match=r"\.label holds 199.5 numbers but .*bin 200 points"):

@@ -113,6 +113,10 @@ class TestFiles:
         assert "before: scan a" in page
         assert "inpaint 1" in page
 
+        # More draws are sorted anew, so they do not go on from these.
+        with pytest.raises(ValueError, match="sorted_of"):
+            edit(files, "inpaint", tmp_path / "o", *scan, *library, num=3)
+
         # An object is moved into its box, at the step to t = 0.5, and its points there are counted.
         box = ["--scan", files / "a.bin", "--box3d", 12, 0, -0.5, 4, 4, 3, 0]
         about = edit(files, "inpaint", tmp_path / "box", *box, *library)

@@ -84,9 +84,11 @@ def test_a_second_judge_has_rows_of_its_own(data, samples, tmp_path, no_figures)
     reference, out = tmp_path / "ref.safetensors", tmp_path / "out"
     judge = {"fwid_judge": files[0]}
     command.reference(data=data, out=reference, spaces=("fgeo", "fwid_judge"), ckpt=judge)
+    samples = samples.rename(tmp_path / "v1.2")
     words = ["--samples", samples, "--reference", reference, "--allow_few", "--out", out]
     evaluate(*words, "--ckpt.fwid_judge", files[0])
     found = Evaluation.load(out / "evaluation.json")
+    assert found.label == "v1.2"
     names = {row.name for row in found.rows}
     assert {"FGEO", "FWID_JUDGE", "FWID_JUDGE recall"} <= names
     assert "FWID" not in names

@@ -96,6 +96,14 @@ class TestWeather:
         named = {name for _, name, _ in page["categories"]["origin"]}
         assert {"surface", "fog", "lost"} <= named
 
+    def test_page_of_a_repeated_command_shows_as_many_scans(self, folder, tmp_path):
+        out = tmp_path / "out"
+        for shown in (1, 2):
+            weather(folder, out, *FOG, "--show", shown)
+            text = (out / "scans.html").read_text()
+            page = json.loads(re.search(r'id="page">(.*?)</script>', text, re.DOTALL)[1])
+            assert page["shown"] == shown
+
     def test_an_interrupted_run_is_completed_to_the_same_bytes(self, folder, foggy, tmp_path):
         out = tmp_path / "out"
         weather(folder, out, *FOG)

@@ -29,6 +29,13 @@ def test_read_metrics_skips_blanks_missing_cells_and_the_unfinished_line(tmp_pat
         viz.read_metrics(path)
 
 
+def test_files_without_a_training_are_no_curves(tmp_path):
+    for number, column in enumerate(("train/flow", "val/error", "test/FWID")):
+        (tmp_path / f"version_{number}").mkdir()
+        (tmp_path / f"version_{number}/metrics.csv").write_text(f"step,{column}\n0,1.0\n")
+    assert list(viz.curves.read_curves(tmp_path)) == ["train/flow"]
+
+
 def test_loss_curves_draws_a_panel_per_quantity_and_logs_where_positive(tmp_path):
     path = tmp_path / "metrics.csv"
     path.write_text(RAGGED)

@@ -223,6 +223,6 @@ def _released_jobs(
     words += ["--allow_few", str(scorer["allow_few"]).lower()]
     words += ["--out", str(stage.evaluation.parent)]
     needs = (*(job.name for job in jobs), "reference")
-    content = f"{of_reference} {given}"
+    content = f"{of_reference} {given} {num} {scorer['allow_few']}"
     test = f"test of {stage.name}"
     return [*jobs, Job(test, words, stage.folder / "test", content, needs, stage.evaluation)]

@@ -99,6 +99,12 @@ def relative_change(
     return mean, (mean - half, mean + half)
 
 
+def _different_runs(row: Row, evaluations: Mapping[int, Evaluation]) -> list[Evaluation]:
+    """Evaluations of the trainings of a row: released weights are the same with every seed."""
+    by_run = {row.stages[seed][-1].name: each for seed, each in evaluations.items()}
+    return list(by_run.values())
+
+
 def _half_width(values: Sequence[float]) -> float:
     """Half the width of Student's 95 % interval of a mean."""
     num = len(values)
@@ -143,7 +149,7 @@ def write_table(plan: Plan, table: Table, failed: Mapping[str, str]) -> tuple[st
     """
     results, missing = _read_results(table, failed)
     means = [
-        mean_of_seeds(row.label, list(results[row.key].values()))
+        mean_of_seeds(row.label, _different_runs(row, results[row.key]))
         for row in table.rows
         if results[row.key]
     ]

@@ -126,7 +126,8 @@ class DryRun:
         saver = trainer.checkpoint_callback
         count = 1 + max(0, saver.save_top_k)
         if saver.save_top_k < 0 < trainer.max_steps:
-            count = math.ceil(trainer.max_steps / saver.every_n_train_steps)
+            every = saver._every_n_train_steps or trainer.max_steps  # 0 with every_n_epochs
+            count = math.ceil(trainer.max_steps / every)
         parts = [f"{count} checkpoints of {_size(size)}, {_size(count * size)}"]
         for callback in trainer.callbacks:
             if not isinstance(callback, EMASnapshots):

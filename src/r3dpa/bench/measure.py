@@ -38,9 +38,6 @@ class Ratio:
         low, high = np.quantile(over / under, [0.025, 0.975]).tolist()
         return cls(median(numerator) / median(denominator), low, high)
 
-    def __str__(self) -> str:
-        return f"{self.value:.3f} ({self.low:.3f}..{self.high:.3f})"
-
 
 @dataclass(frozen=True)
 class PairedTimings:

@@ -202,7 +202,6 @@ def run_problem(
         evaluation, rest = flop[way.decoder]
         row = _row(label, way, error, timing.seconds[label], way.nfe * evaluation + rest)
         rows.append(row | {"converged": self_error < row["error"] / _MARGIN})
-    unsure = [row["label"] for row in rows if not row["converged"]]
     return {
         "rows": rows,
         "front": pareto_front(rows),
@@ -211,8 +210,6 @@ def run_problem(
             "steps": effort.reference_steps,
             "samples": effort.samples,
             "self_error": self_error,
-            "certified": not unsure,
-            "not_converged": unsure,
         },
         "timing": {"a_a": asdict(timing.repeat), "sound": timing.sound},
         "flop": dict(zip(("evaluation", "rest"), flop["full"], strict=True)),

@@ -81,6 +81,7 @@ def inpaint(
     if object is not None:
         check_features(shared.ckpt)
         arguments["objects"] = objects = objects or objects_file(shared.ckpt)
+        arguments["sorted_of"] = num  # of more draws, the first ones are others
     from r3dpa.editing import EditResult, most_like_first, regions
     from r3dpa.editing.objects import ObjectLibrary
     from r3dpa.scene_files.edits import EditSession
@@ -267,7 +268,9 @@ def vary(*, scan: Path, start: float = 0.5, num: PositiveInt = 8, **options: Any
 
 
 def interpolate(*, left: Path, right: Path, frames: int = 8, **options: Any) -> str:
-    """Generate scenes on the way from one scan to another, through noise.
+    """Generate scenes on the way from one scan to another, through noise of the scans themselves.
+
+    Nothing is drawn, so that ``--seed`` changes nothing.
 
     Args:
         left: Scan of the first frame: .bin, .pcd, .ply, .npy, .npz or .las.

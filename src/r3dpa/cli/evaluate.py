@@ -136,11 +136,12 @@ def evaluate(
     files = read_samples(
         samples, setting.sensor, unprojection=setting.unprojection, skip_bad=skip_bad
     )
+    place = samples.resolve()
     comparison = metrics.evaluate(
         (EvaluationScene(*sample) for sample in tqdm(files, "samples", disable=None)),
         statistics,
         networks,
-        label=label or samples.stem,
+        label=label or (place.name if place.is_dir() else place.stem),
         source=str(samples),
         made_with=made_with,
         allow_few=allow_few,

@@ -67,7 +67,7 @@ _CHECKPOINT_OPTIONS = (
 )
 _YAML = (".yaml", ".yml")
 _CLASS_KEYS = ("init_args", "dict_kwargs", "help")  # beside arguments of a class
-_CHECKPOINT_WORDS = ("last", "best", "hpc", "null")  # of --ckpt_path, beside files
+_CHECKPOINT_WORDS = ("last", "null")  # of --ckpt_path, beside files
 
 
 def run(args: list[str]) -> None:
@@ -227,7 +227,8 @@ def _check_words(command: str, words: list[str]) -> None:
     for option, value in _options(words):
         _check_option(command, option, _OPTIONS)
         _check_config(command, option, value)
-        if option in checkpoint_options and not value.startswith((*_CHECKPOINT_WORDS, "hf:/")):
+        is_file = value not in _CHECKPOINT_WORDS and not value.startswith("hf:/")
+        if option in checkpoint_options and is_file:
             try:
                 weights_file(value)
             except FileNotFoundError as error:

@@ -367,8 +367,9 @@ def _figure_data(
     _, scans = measured.metrics["matching"].subset("real")
     halves = [metrics_by_name(half) for half in reference.halves]
     scan_names = [
-        reference.names_of_half(index)[place]
+        names[place]
         for index, half in enumerate(halves)
+        for names in [reference.names_of_half(index)]
         for place in half["matching"].subset("real")[0]
     ]
     matches = []

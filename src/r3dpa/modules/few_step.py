@@ -73,8 +73,8 @@ class FewStep(FlowMatching):
         thin_decoder: Decoder to distil; None trains none.
         trajectories: Number of trajectories, 16 velocities each in the precision of the steps.
         **kwargs: See :class:`FlowMatching`. ``init_from`` is a checkpoint of stage flow_matching,
-            joint or few_step, whose averaged SiT is taken. Of the loss weights ``denoising`` (average
-            velocity) counts and, for the thin decoder, ``reconstruction``, ``returns``,
+            joint or few_step, whose averaged SiT is taken. Of the loss weights ``denoising``
+            (average velocity) counts and, for the thin decoder, ``reconstruction``, ``returns``,
             ``intensity`` and ``classes``; times are uniform.
     """
 

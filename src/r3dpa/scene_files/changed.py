@@ -118,7 +118,7 @@ def change_scans(
         where = f", see {out / _REPORT}" if has_results else ""
         more = f" ({len(bad)} of {len(paths)} scans cannot be used{where})"
         raise ScanError(bad[0] + (more if len(paths) > 1 else ""))
-    if options.show and (todo or not (out / _PAGE).exists()):
+    if options.show:
         _write_page(job, evenly(files, options.show))
     return _summary([lines[name] for name in paths], len(todo), out)
 

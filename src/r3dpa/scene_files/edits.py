@@ -237,8 +237,7 @@ class EditSession:
             del settings["strength"], settings["window"]
         if self.baseline is not None:
             settings = {"steps": self.baseline.sampler.steps}
-        left_out = ("options", "num", "workers")
-        request = {name: value for name, value in arguments.items() if name not in left_out}
+        request = dict(arguments)
         request |= {"columns": options.columns} if options.columns else {}
         request |= provenance(self.checkpoint, options, self.num, self.device, self.geometry)
         request |= {"command": command, "guided": guided, "settings": settings, **sources}

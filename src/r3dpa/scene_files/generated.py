@@ -18,6 +18,7 @@ from lidarsim.clouds import check_metres
 from lidarsim.scan_files import read_beside, read_clouds
 from r3dpa import viz
 from r3dpa.checkpoints import Checkpoint, read_snapshot
+from r3dpa.data.labels import find_labels
 from r3dpa.data.scans import find_scans
 from r3dpa.data.scene_writer import SceneWriter
 from r3dpa.flow.sampler import Quality
@@ -140,7 +141,8 @@ def page_scans(source: Path, columns: Sequence[str] = ()) -> list[Callable[[], v
         check_metres(path, points)
         if path.suffix != ".bin":
             return viz.PageScan(name, points)
-        return viz.PageScan(name, points, read_beside(path, "labels"), read_beside(path, "origins"))
+        labels = find_labels(path, len(points))
+        return viz.PageScan(name, points, labels, read_beside(path, "origins"))
 
     def member(name: str, points: np.ndarray) -> viz.PageScan:
         check_metres(f"{source}: {name}", points)

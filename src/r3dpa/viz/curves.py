@@ -88,13 +88,13 @@ def read_curves(run: Path) -> dict[str, Series]:
     """Quantities of a training by step, from the ``version_*/metrics.csv`` of each start.
 
     Where a start repeats steps of an earlier one, its values replace the earlier ones. Files of
-    ``r3dpa validate``, which have no training losses, are left out.
+    ``r3dpa validate`` and ``test``, which have no training losses, are left out.
     """
     curves: dict[str, dict[float, float]] = {}
     paths = run.glob("version_*/metrics.csv")
     for path in sorted(paths, key=lambda path: path.stat().st_mtime):
         series = read_metrics(path)
-        if series and all(name.startswith("val/") for name in series):
+        if series and all(name.startswith(("val/", "test/")) for name in series):
             continue
         for name, (steps, values) in series.items():
             curves.setdefault(name, {}).update(zip(steps, values, strict=True))
