@@ -173,7 +173,9 @@ def test_a_file_is_read_resumed_or_renewed(tmp_path):
         (empty(27, spaces=(replace(TOY, card={**CARD, "weights": "x"}),)), "spaces"),
         (ReferenceStatistics(PROTOCOL, cards_of([TOY]), empty(27).names, {"data": "x"}), "about"),
     ):
-        with pytest.raises(ValueError, match=f"of another job: its {key} differ.*delete the file"):
+        with pytest.raises(
+            ValueError, match=rf"of another job \({key}.* there, .* now\): .*delete the file"
+        ):
             compute_reference(other, scans_from, [TOY], out)
     compute_reference(empty(27, unprojection="corner"), scans_from, [TOY], out, renew=True)
     assert started == [16, 0]

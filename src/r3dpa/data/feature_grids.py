@@ -338,26 +338,14 @@ def write_feature_grids(
         # Again, since another process may have made some.
         todo = plan(scans, extractor, projection, grid_sizes, features_dir)
         dataset = PointDataset(todo.missing, projection.sensor, extractor.prepare, images)
-        extract_grids(dataset, extractor, projection, todo.stores, workers, batch_size)
+        loader = plain_loader(dataset, batch_size, workers, collate_fn=list)
+        with ExitStack() as stack:
+            writers = {size: stack.enter_context(s.writer()) for size, s in todo.stores.items()}
+            for samples in tqdm(loader, desc="feature grids", unit="scan", disable=None):
+                grids = pooled_grids(extractor, samples, projection, list(todo.stores))
+                for size, writer in writers.items():
+                    writer.add([sample.key for sample in samples], grids[size])
     return len(todo.missing)
-
-
-def extract_grids(
-    dataset: PointDataset,
-    extractor: Extractor,
-    projection: Projection,
-    stores: Mapping[tuple[int, int], Store],
-    workers: int = 0,
-    batch_size: int = 1,
-) -> None:
-    """Add the grids of all scans of a data set to the stores of their sizes."""
-    loader = plain_loader(dataset, batch_size, workers, collate_fn=list)
-    with ExitStack() as stack:
-        writers = {size: stack.enter_context(store.writer()) for size, store in stores.items()}
-        for samples in tqdm(loader, desc="feature grids", unit="scan", disable=None):
-            grids = pooled_grids(extractor, samples, projection, list(stores))
-            for size, writer in writers.items():
-                writer.add([sample.key for sample in samples], grids[size])
 
 
 @contextmanager

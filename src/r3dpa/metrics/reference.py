@@ -19,7 +19,14 @@ from torch import Tensor
 from torchmetrics import MetricCollection
 from tqdm import tqdm
 
-from r3dpa.io import UNPICKLING_ERRORS, atomic_path, first_line, only_writer, refuse_name
+from r3dpa.io import (
+    UNPICKLING_ERRORS,
+    atomic_path,
+    differences,
+    first_line,
+    only_writer,
+    refuse_name,
+)
 from r3dpa.metrics.collection import (
     batches_with_features,
     metrics_by_name,
@@ -268,9 +275,11 @@ def compute_reference(
             try:
                 stored = ReferenceStatistics.load(path)
                 for key in ("protocol", "spaces", "names", "about"):
-                    if getattr(stored, key) != getattr(job, key):
+                    its, wanted = getattr(stored, key), getattr(job, key)
+                    if its != wanted:
+                        differ = "; ".join(differences(its, wanted, key))
                         raise ValueError(
-                            f"{path} is of another job: its {key} differ; repeat that command to "
+                            f"{path} is of another job ({differ}): repeat that command to "
                             "complete it, delete the file to start anew, or give another --out"
                         )
                 statistics = stored
