@@ -7,9 +7,14 @@ import math
 import pytest
 import torch
 
-from r3dpa.geometry import LidarSensor, RangeCodec
+from r3dpa.geometry import NUM_CLASSES, SEMANTIC_CLASSES, LidarSensor, RangeCodec
 from r3dpa.nn import VAE
-from r3dpa.nn.pixel_outputs import RangeMixture, without_flying_pixels, without_ripples
+from r3dpa.nn.pixel_outputs import (
+    RangeMixture,
+    clean_image,
+    without_flying_pixels,
+    without_ripples,
+)
 
 STEM = {"in_channels": 2, "latent_channels": 4, "stem": (4, 8), "channels": 32}
 STEM |= {"channel_multipliers": (1, 2), "strides": ((2, 2),), "num_res_blocks": 1, "modes": 2}
@@ -116,6 +121,20 @@ def test_ripples_are_smoothed_and_edges_stay():
     found = without_ripples(missing)
     assert torch.equal(found[..., 1:9], missing[..., 1:9])
     assert found[0, 0, 0, 0].abs() < 0.005
+
+
+def test_walls_are_smoothed_twice_and_other_classes_once():
+    ranges = 0.005 * torch.randn(1, 1, 2, 64, generator=torch.Generator().manual_seed(0))
+    image = torch.cat([ranges, torch.ones_like(ranges)], dim=1)
+    classes = torch.zeros(1, NUM_CLASSES, 2, 64)
+    names = [known.name for known in SEMANTIC_CLASSES]
+    classes[:, names.index("building"), :, :32] = 50.0
+    classes[:, names.index("vegetation"), :, 32:] = 50.0
+    once = without_ripples(without_flying_pixels(image))
+    found = clean_image(image, classes)
+    torch.testing.assert_close(found[..., :32], without_ripples(once)[..., :32])
+    torch.testing.assert_close(found[..., 32:], once[..., 32:])
+    assert torch.equal(clean_image(image, classes[:, :3]), once)  # of other classes
 
 
 def test_decoding_leaves_few_flying_pixels_and_ripples_to_two_modes():

@@ -12,11 +12,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from r3dpa.geometry import NUM_CLASSES, SEMANTIC_CLASSES
 from r3dpa.nn.layers import at_least_float32
 
 _FLYING_GAP = 0.01  # from both neighbours, encoded: 2 % of the range in log2, 0.28 m in linear
 _RIPPLE = 0.02  # neighbours that much nearer or farther have 1 / e of the weight; 4 % in log2
 _RIPPLE_COLUMNS = 12  # on both sides
+_WALLS = [n for n, known in enumerate(SEMANTIC_CLASSES) if known.name in ("building", "wall")]
 
 
 class PixelOutputs(NamedTuple):
@@ -66,6 +68,23 @@ class RangeMixture:
         distance = (image - self.centres).abs() * torch.exp(-self.log_scales)
         density = self.log_weights - self.log_scales - math.log(2.0) - distance
         return -density.logsumexp(dim=1, keepdim=True)
+
+
+def clean_image(image: Tensor, classes: Tensor | None = None) -> Tensor:
+    """Images without flying pixels and ripples, the latter twice where a decoder sees walls.
+
+    Leaves and ground, which one pass leaves about as rough as in scans, are not smoothed further.
+
+    Args:
+        image: As of :func:`without_flying_pixels`.
+        classes: ``(B, num_classes, H, W)`` logits of the classes of
+            :data:`r3dpa.geometry.SEMANTIC_CLASSES`; without, or of others, no wall is known.
+    """
+    image = without_ripples(without_flying_pixels(image))
+    if classes is None or classes.shape[1] != NUM_CLASSES:
+        return image
+    walls = classes.softmax(dim=1)[:, _WALLS].sum(dim=1, keepdim=True)
+    return torch.lerp(image, without_ripples(image), walls)
 
 
 def without_flying_pixels(image: Tensor) -> Tensor:

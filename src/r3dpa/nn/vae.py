@@ -28,12 +28,7 @@ from r3dpa.nn.layers import (
     downsample,
     zeroed,
 )
-from r3dpa.nn.pixel_outputs import (
-    PixelOutputs,
-    RangeMixture,
-    without_flying_pixels,
-    without_ripples,
-)
+from r3dpa.nn.pixel_outputs import PixelOutputs, RangeMixture, clean_image
 from r3dpa.nn.refinement import Refinement
 
 # AdamW moves a weight by at most the learning rate per step: without this gain, logits need
@@ -316,7 +311,7 @@ class VAE(Autoencoder):
         outputs, image = self.outputs_of(prediction), prediction[:, : self.in_channels]
         if self.modes == 2:
             mode, returns = self.mixture_of(prediction).mode(), cast(Tensor, outputs.returns)
-            image = without_ripples(without_flying_pixels(torch.cat([mode, returns], dim=1)))
+            image = clean_image(torch.cat([mode, returns], dim=1), outputs.classes)
         further = [] if outputs.intensity is None else [outputs.intensity]
         if outputs.classes is not None:
             further.append(outputs.classes.argmax(dim=1, keepdim=True).to(prediction.dtype))
