@@ -41,7 +41,8 @@ class RunCheckpoint(ModelCheckpoint):
     After SIGTERM, as job systems send it before they end a job, or Ctrl-C (SIGINT) the next
     optimiser step, or the next validation batch of a single process, is the last: ``last.ckpt`` is
     saved and all processes end with status 143 or 130. It is enough that one process receives the
-    signal. A second Ctrl-C ends a single process at once, without saving.
+    signal. A second Ctrl-C ends a single process at once, without saving. A validation that was
+    interrupted is not repeated by the resumed run.
 
     Processes that resume from different checkpoints are refused, and a run resumed at the end of an
     epoch starts the next one. After a resume within an epoch, Lightning's ``epoch`` counts one

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -25,6 +26,14 @@ if TYPE_CHECKING:
 
 class ReconstructionWriter(L.Callback):
     """Writes what ``r3dpa predict`` reconstructs, as ``<run_dir>/reconstructions/<scan>.bin``."""
+
+    def on_predict_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Refuse scans of equal names, as two data sets may have them: their files would be one."""
+        dataset = getattr(cast(Any, trainer).datamodule, "all_set", None)
+        names = Counter(scan.name for scan in dataset.scans) if dataset is not None else Counter()
+        name, count = next(iter(names.most_common(1)), ("", 1))
+        if count > 1:
+            raise ValueError(f"{count} scans have the name {name}: predict each data set by itself")
 
     def on_predict_batch_end(
         self,

@@ -237,14 +237,14 @@ class GenerativeModule(Stage):
         if self.init_from is not None:
             given = read_checkpoint(self.init_from)
             before = self.previous_networks(given)
-            own = {"vae": self.vae, "sit": self.sit, "latent_norm": self.latent_norm}
-            own |= self.trainable()
-            if unknown := [name for name in self.init_networks if name not in own]:
+            of_stage = {"vae": self.vae, "sit": self.sit, "latent_norm": self.latent_norm}
+            of_stage |= self.trainable()
+            if unknown := [name for name in self.init_networks if name not in of_stage]:
                 raise ValueError(
                     f"--model.init_args.init_networks names {unknown[0]!r}, but the networks of "
-                    f"this stage are {', '.join(own)}"
+                    f"this stage are {', '.join(of_stage)}"
                 )
-            networks = {name: own[name] for name in self.init_networks}
+            networks = {name: of_stage[name] for name in self.init_networks}
             if self.init_other_sensor:
                 before, rows = resize_to(networks, before, given)
                 rank_zero_info(f"weights of another sensor from {self.init_from}\n{_table(rows)}")
