@@ -43,7 +43,7 @@ def kitti_label(scan: SimulatedScan, sensor_to_world: NDArray[np.float64]) -> st
     """
     labels = set(np.unique(scan.labels).tolist())
     parts = defaultdict(list)
-    for primitive in scan.scene.primitives:
+    for primitive in (*scan.scene.primitives, *scan.scene.unseen):
         label = int(primitive.semantic) | primitive.instance << 16
         if primitive.instance and primitive.semantic in KITTI_TYPES and label in labels:
             parts[label].append(primitive)

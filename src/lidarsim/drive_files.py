@@ -3,7 +3,7 @@
 ::
 
     data_3d_raw/2013_05_28_drive_XXXX_sync/velodyne_points/
-        timestamps.txt                  one line per scan, 10 Hz
+        timestamps.txt                  one line per scan, 0.1 s apart, or a multiple
         data/%010d.bin                  (P, 4) float32 x, y, z, intensity
         labels/%010d.label              (P,) uint32 semantic | instance << 16
         origins/%010d.origin            (P,) uint8 origin of each point, see ``Origin``
@@ -54,6 +54,7 @@ class DriveFiles:
 
     def missing(self, count: int) -> list[int]:
         """Numbers below ``count`` of the scans that lack a file, or whose points lack a label."""
+        boxes = {path.stem for path in (self.points_folder / "boxes").glob("[!.]*")}
         sizes = {
             kind: {p.stem: p.stat().st_size for p in (self.points_folder / kind).glob("[!.]*")}
             for kind in _SUFFIXES
@@ -61,7 +62,7 @@ class DriveFiles:
         complete = {
             stem
             for stem, size in sizes["data"].items()
-            if size > 0
+            if stem in boxes
             and sizes["labels"].get(stem) == size // 4
             and sizes["origins"].get(stem) == size // 16
             and sizes["sim"].get(stem)
@@ -102,9 +103,12 @@ class DriveFiles:
         advice = "delete it and simulate again, which completes the data set"
         return [read_json(self._path("sim", number), advice) for number in range(count)]
 
-    def write_times_and_poses(self, summaries: Sequence[dict[str, Any]]) -> None:
-        """Write ``timestamps.txt`` and ``velodyne_to_world.txt`` of all scans, in order."""
-        stamps = (_FIRST_SCAN + summary["scan"] * _SCAN_PERIOD for summary in summaries)
+    def write_times_and_poses(self, summaries: Sequence[dict[str, Any]], every: int) -> None:
+        """Write ``timestamps.txt`` and ``velodyne_to_world.txt`` of all scans, in order.
+
+        ``every`` is the stride of the files in scans of the drive.
+        """
+        stamps = (_FIRST_SCAN + summary["scan"] * every * _SCAN_PERIOD for summary in summaries)
         # KITTI-360 stores nanoseconds.
         times = "".join(f"{stamp:%Y-%m-%d %H:%M:%S.%f}000\n" for stamp in stamps)
         write(self.points_folder / "timestamps.txt", times.encode())

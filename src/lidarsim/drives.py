@@ -155,7 +155,7 @@ def simulate(
     if every > 1:
         request["every"] = every
     files = {DriveFiles(out, drive): count for drive, count in counts.items()}
-    holds_more = _check_folder(out, request)
+    holds_more = _check_folder(out, request) and _is_finished(out, files)
     read_only = out.is_dir() and not os.access(out, os.W_OK)
     if (read_only or holds_more) and not any(d.missing(count) for d, count in files.items()):
         return make_report(_summaries(files), 0)
@@ -168,9 +168,9 @@ def simulate(
         classes = "".join(f"{int(semantic)}: {semantic.name.lower()}\n" for semantic in Semantic)
         write(out / _CLASSES, classes.encode())
         num_written = _write_missing(files, simulators, every, workers)
-        if holds_more:  # whose poses and report cover all scans
+        if holds_more and _is_finished(out, files):
             return make_report(_summaries(files), num_written)
-        return _finish(out, files, num_written)
+        return _finish(out, files, num_written, every)
 
 
 def _write_missing(
@@ -270,15 +270,26 @@ def _run(task: _Task) -> int:
     return len(numbers)
 
 
-def _finish(out: Path, files: Mapping[DriveFiles, int], num_written: int) -> SimulationReport:
+def _is_finished(out: Path, files: Mapping[DriveFiles, int]) -> bool:
+    """Whether the report, the last file of a data set, covers as many scans of each drive."""
+    path = out / "report.json"
+    if not path.exists():
+        return False
+    counts = read_json(path, "delete it and simulate again")["scans_per_drive"]
+    return all(counts.get(drive.drive, 0) >= count for drive, count in files.items())
+
+
+def _finish(
+    out: Path, files: Mapping[DriveFiles, int], num_written: int, every: int
+) -> SimulationReport:
     summaries = []
     for drive, count in files.items():
         of_drive = drive.summaries(count)
-        drive.write_times_and_poses(of_drive)
+        drive.write_times_and_poses(of_drive, every)
         summaries += of_drive
         # At the end: the workers of a killed run may outlive it by a moment.
         drive.delete_unfinished()
-    for path in out.glob(".*.partial.json"):
+    for path in out.glob(".*.partial.*"):
         path.unlink(missing_ok=True)
     report = make_report(summaries, num_written)
     write(out / "report.json", to_json(report.to_dict()))

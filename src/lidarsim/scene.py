@@ -283,6 +283,7 @@ class Scene:
     ground_m: float = 0.0  # height of the level ground below all solids
     ground_reflectivity: float = 0.15  # of that ground: asphalt, labelled as road
     sheet_points: int = 0  # points of a recorded scan that are as bright as sheeting
+    unseen: tuple[Primitive, ...] = ()  # details of far objects, which are not cast
 
     def __post_init__(self) -> None:
         if not 0 < self.ground_reflectivity <= 1:

@@ -1,6 +1,8 @@
 """3-D boxes of the objects of simulated scans, and the names of their classes."""
 
+from collections import defaultdict
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from lidarsim import Semantic, Simulator, simulate
 from lidarsim.boxes import KITTI_TYPES, kitti_label
 from lidarsim.drive_files import velodyne_to_world
 from lidarsim.scene import Pose, Primitive, Scene, Shape
+from lidarsim.street import Street
 
 
 def boxes_of(text):
@@ -62,6 +65,25 @@ def data_set(tmp_path_factory):
     out = tmp_path_factory.mktemp("boxes")
     simulate(out, 1, drives=["0002"])
     return out
+
+
+def test_a_box_does_not_depend_on_the_distance():
+    """Wheels, mirrors and roofs are built near the sensor only, but belong to the object."""
+    street, sizes = Street(seed=0, drive=0), defaultdict(set)
+    for number in range(0, 60, 10):
+        scene = street.scene(number)
+        standing = {
+            int(solid.semantic) | solid.instance << 16
+            for solid in (*scene.primitives, *scene.unseen)
+            if solid.instance and solid.semantic in KITTI_TYPES and not any(solid.velocity_m_s)
+        }
+        labels = sorted(standing)
+        scan = SimpleNamespace(scene=scene, labels=np.array(labels, np.uint32))
+        boxes = boxes_of(kitti_label(scan, velodyne_to_world(scene.pose)))
+        for label, (_, size, _, _) in zip(labels, boxes, strict=True):
+            sizes[label].add(tuple(size))
+    assert len(sizes) > 5
+    assert all(len(each) == 1 for each in sizes.values())
 
 
 def test_a_data_set_names_its_classes(data_set):

@@ -116,6 +116,7 @@ def test_an_unfinished_request_is_completed(tmp_path):
     whole, folder = files_of(tmp_path), points_folder(tmp_path, "0003")
     for number, (kind, suffix) in enumerate(KINDS.items()):
         (folder / kind / f"{number:010d}{suffix}").unlink()
+    (folder / "boxes" / "0000000003.txt").unlink()
     (folder / "data" / "0000000004.bin").write_bytes(b"")
     labels = folder / "labels" / "0000000005.label"
     labels.write_bytes(labels.read_bytes()[:-4])
@@ -187,6 +188,32 @@ def test_a_larger_data_set_serves_a_smaller_request(tmp_path):
     assert files_of(tmp_path) == before
 
 
+def test_a_smaller_request_after_a_larger_one_that_was_interrupted_is_finished(tmp_path):
+    request = {"drives": ["0003"]} | SMALL
+    simulate(tmp_path / "whole", 2, **request)
+    simulate(tmp_path / "out", 4, **request)
+    for path in (tmp_path / "out" / "report.json", *(tmp_path / "out").rglob("*times*.txt")):
+        path.unlink()
+    simulate(tmp_path / "out", 2, **request)
+    whole, out = files_of(tmp_path / "whole"), files_of(tmp_path / "out")
+    named = [path for path in whole if path.name in ("report.json", "timestamps.txt")]
+    assert [out[path] for path in named] == [whole[path] for path in named]
+    assert simulate(tmp_path / "out", 4, **request).scans_per_drive == {"0003": 4}
+
+
+def test_times_of_a_stride_are_its_multiple_apart(tmp_path):
+    simulate(tmp_path, 2, drives=["0003"], every=40, **SMALL)
+    times = (points_folder(tmp_path, "0003") / "timestamps.txt").read_text().split()
+    assert times[1::2] == ["08:46:02.000000000", "08:46:06.000000000"]
+
+
+def test_scans_without_a_point_are_complete(tmp_path):
+    request = {"drives": ["0003"], "weather": Conditions(visibility_m=1)} | SMALL
+    for num_written in (2, 0):
+        report = simulate(tmp_path, 2, **request)
+        assert (report.num_written, report.num_empty) == (num_written, 2)
+
+
 def test_foreign_data_are_left_alone(tmp_path):
     (tmp_path / "data_3d_raw").mkdir()
     with pytest.raises(ValueError, match=r"was not simulated"):
@@ -211,6 +238,7 @@ def test_files_of_a_killed_run_are_deleted_and_those_of_others_are_not(tmp_path,
         folder / "data" / ".0000000001.1a2b3c4d.partial.bin",
         poses / ".velodyne_to_world.1a2b3c4d.partial.txt",
         tmp_path / ".simulation.1a2b3c4d.partial.json",
+        tmp_path / ".classes.1a2b3c4d.partial.yaml",
     ):
         path.write_bytes(b"half")
     grid = tmp_path / "feature_grids" / ".index.1a2b3c4d.partial.json"

@@ -25,7 +25,7 @@ from lidarsim.effects.instrument import MAX_SPREADS
 from lidarsim.raycast import surface_distance
 from lidarsim.scene import Primitive, Scene, Semantic, Shape
 from lidarsim.sensors.spinning import SpinningLidar
-from lidarsim.solids import NO_SURFACE, Floats, Solids, solids_of
+from lidarsim.solids import NO_SURFACE, Floats, solids_of
 from lidarsim.sweep import Effect, Origin, Sweep
 
 # Backscatter over extinction of clouds of water droplets, see Fog.
@@ -165,13 +165,14 @@ class Spray(Effect):
         flooded = scene.weather.water_film_mm / 1.2
         drawn = draws.uniform(slice(None))
         for index, window in enumerate(sweep.rays_near(solids)):
-            chosen, start = _around(solids, index, sweep, window)
+            start = sweep.start[:, window]
+            start[:2] -= solids.velocity[index][:, None] * sweep.time_s[window]
             enter, leave = surface_distance(
-                solids, np.full(len(chosen), index), start, sweep.direction[:, chosen]
+                solids, np.full(len(window), index), start, sweep.direction[:, window]
             )
             enter = np.maximum(enter, np.float32(sensor.min_range_m))
             crossed = leave > enter
-            chosen, enter, leave = chosen[crossed], enter[crossed], leave[crossed]
+            chosen, enter, leave = window[crossed], enter[crossed], leave[crossed]
             faster = (math.hypot(*boxes[index].velocity_m_s) - _FAST_M_S) / 10.0
             extinction = self.max_extinction_per_m * min(faster, 1.0) * min(flooded, 1.0)
             twice = np.float32(2 * extinction)
@@ -196,29 +197,6 @@ def _plumes(scene: Scene) -> tuple[Primitive, ...]:
                 # Solids that belong to no object are vehicles of their own.
                 vehicles[primitive.instance or -1 - index].append(primitive)
     return tuple(_plume(parts) for parts in vehicles.values())
-
-
-def _around(
-    solids: Solids, index: int, sweep: Sweep, rays: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], Floats]:
-    """Rays that meet a box as seen from above, and their start relative to the box."""
-    direction = sweep.direction[:2, rays]
-    shift = solids.velocity[index][:, None]
-    to_centre = solids.centre[index, :2, None] + shift * sweep.time_s[rays]
-    to_centre -= sweep.start[:2, rays]
-    # Rays in the box's axes, and how far it reaches along them and to their sides.
-    half_long, half_wide, _ = solids.half_size[index]
-    cosine, sine = solids.cos_yaw[index], solids.sin_yaw[index]
-    long = np.abs(cosine * direction[0] + sine * direction[1])
-    wide = np.abs(cosine * direction[1] - sine * direction[0])
-    across = direction[0] * to_centre[1] - direction[1] * to_centre[0]
-    ahead = direction[0] * to_centre[0] + direction[1] * to_centre[1]
-    meets = np.abs(across) <= half_long * wide + half_wide * long
-    meets &= ahead >= -(half_long * long + half_wide * wide)
-    met = rays[meets]
-    start = sweep.start[:, met]
-    start[:2] -= shift * sweep.time_s[met]
-    return met, start
 
 
 def _plume(parts: list[Primitive]) -> Primitive:

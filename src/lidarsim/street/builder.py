@@ -111,7 +111,7 @@ class Builder:
             half_size = (part.size[0] / 2, part.size[1] / 2, part.size[2] / 2)
             primitive = Primitive(
                 part.shape, centre, half_size, part.semantic, part.reflectivity, heading, instance,
-                part.material, velocity, grade, part.extinction_per_m, part.slats,
+                part.material, velocity, grade, part.extinction_per_m,
             )  # fmt: skip
             (self.details if part.detail else self.primitives).append(primitive)
 

@@ -99,7 +99,10 @@ class Street:
         pose = _pose(course, scan, sensor_height_m)
         speed_m_s = course.speed_m_s(scan) * course.section(s).stretch(course.ego_lateral_m)
         here = (pose.x_m, pose.y_m)
-        primitives += [p for p in details if math.dist(p.centre[:2], here) < _DETAIL_M]
+        near, far = list[Primitive](), list[Primitive]()
+        for detail in details:
+            (near if math.dist(detail.centre[:2], here) < _DETAIL_M else far).append(detail)
+        primitives += near
         around = range(ego_block - _BLOCKS_BEHIND, ego_block + _BLOCKS_AHEAD + 2)
         return Scene(
             tuple(primitives),
@@ -110,6 +113,7 @@ class Street:
             recording_car(),
             min(course.section_of(number).z_m for number in around) - _LEVEL_GROUND_M,
             course.road_reflectivity,
+            unseen=tuple(far),
         )
 
     def weather_of(self, scan: int) -> Conditions:

@@ -33,7 +33,7 @@ _SPOKES_PER_M, _TUBES_PER_M = 18.0, 25.0
 class Part(NamedTuple):
     """One solid of a body: centre and full size in metres, x forward, y left, z above the ground.
 
-    ``detail``: built near the sensor only. ``extinction_per_m`` and ``slats``: see ``Primitive``.
+    ``detail``: built near the sensor only. ``extinction_per_m``: see ``Primitive``.
     """
 
     centre: tuple[float, float, float]
@@ -44,7 +44,6 @@ class Part(NamedTuple):
     shape: Shape = Shape.BOX
     detail: bool = False
     extinction_per_m: float = 0.0
-    slats: tuple[float, float] = (0.0, 1.0)
 
 
 Body = tuple[Part, ...]
