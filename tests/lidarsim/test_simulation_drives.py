@@ -112,18 +112,18 @@ def test_same_seed_same_bytes_for_any_number_of_workers(tmp_path):
 
 
 def test_an_unfinished_request_is_completed(tmp_path):
-    simulate(tmp_path, 6, drives=["0003"], **SMALL)
+    simulate(tmp_path, 7, drives=["0003"], **SMALL)
     whole, folder = files_of(tmp_path), points_folder(tmp_path, "0003")
     for number, (kind, suffix) in enumerate(KINDS.items()):
         (folder / kind / f"{number:010d}{suffix}").unlink()
-    (folder / "boxes" / "0000000003.txt").unlink()
+    (folder / "boxes" / "0000000006.txt").unlink()
     (folder / "data" / "0000000004.bin").write_bytes(b"")
     labels = folder / "labels" / "0000000005.label"
     labels.write_bytes(labels.read_bytes()[:-4])
     for path in (folder / "timestamps.txt", *tmp_path.rglob("velodyne_to_world.txt")):
         path.unlink()
-    report = simulate(tmp_path, 6, drives=["0003"], **SMALL)
-    assert report.num_written == 6
+    report = simulate(tmp_path, 7, drives=["0003"], **SMALL)
+    assert report.num_written == 7
     assert files_of(tmp_path) == whole
 
 
