@@ -18,7 +18,7 @@ _OF_STAGE = {
     "lidm": ["lidm"],
     "lidm_first_stage": ["lidm"],
 }
-_OF_NETWORK = {"VAE": "lidm", "SiT": "sit", "AverageVelocitySiT": "sit"}
+_OF_NETWORK = {"VAE": "lidm", "UNet": "lidm", "SiT": "sit", "AverageVelocitySiT": "sit"}
 _OF_FEATURES = {
     "waffleiron-s": ["waffleiron"],
     "waffleiron-s-2": ["waffleiron"],

@@ -113,7 +113,7 @@ def balanced_generator_loss(fake_logits: Tensor, image: Tensor, ratio: float) ->
     depending on the discriminator.
 
     Source: as the adaptive weight of Esser et al., "Taming transformers" (CVPR 2021), per sample
-    and at the image, so that results do not depend on how a batch is split.
+    and at the image, so that results do not depend on how processes split a batch.
 
     Args:
         fake_logits: Patch logits of the images, any shape.

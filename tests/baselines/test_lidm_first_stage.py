@@ -23,6 +23,14 @@ def test_images_without_a_patch_of_the_discriminator_are_refused():
         stage.image_shape()
 
 
+def test_a_weight_of_the_mask_needs_a_mask():
+    network = VQAutoencoder(
+        num_codes=8, channels=32, channel_multipliers=[1, 1, 1, 1], num_res_blocks=1
+    )
+    with pytest.raises(ValueError, match=r"mask_factor 0\.5 needs a network with mask"):
+        LiDMFirstStage(network, PatchDiscriminator(channels=4, num_layers=3), mask_factor=0.5)
+
+
 @pytest.mark.parametrize("num_layers", [1, 2, 3])
 def test_images_of_the_least_size_hold_one_patch(num_layers):
     discriminator = PatchDiscriminator(channels=4, num_layers=num_layers)
@@ -51,3 +59,12 @@ def test_codes_of_another_width_than_the_encoder_gives(tmp_path):
     assert read.latent_channels == 3
     with torch.no_grad():
         assert torch.equal(read.decode(latents), network.decode(latents))
+
+
+def test_a_file_of_lidm_without_an_average_says_so(tmp_path):
+    sizes = {"num_codes": 8, "channels": 32, "channel_multipliers": (1, 1), "num_res_blocks": 1}
+    network = VQAutoencoder(**sizes, strides=((2, 2),))
+    weights = {f"first_stage_model.{key}": value for key, value in network.state_dict().items()}
+    weights["model.diffusion_model.out.2.weight"] = torch.zeros(1)
+    with pytest.raises(ValueError, match=r"holds no averaged weights \(model_ema\.\*\) of LiDM"):
+        from_lidm({"state_dict": weights}, tmp_path / "model.ckpt")

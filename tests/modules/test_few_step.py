@@ -35,6 +35,12 @@ def test_the_velocity_of_straight_paths_is_their_average(time):
     torch.testing.assert_close(logged["train/denoising"], noise.square().mean())
 
 
+def test_the_vae_decodes_as_it_does_for_users():
+    module = stage_module("few_step").train()
+    assert module.sit.training
+    assert not any(part.training for part in module.vae.modules())
+
+
 def test_steps_of_1_2_4_and_8_are_learned_equally_often():
     """Of 32 equal times: each step that a sampler takes, the single one 8 times."""
     module, asked = stage_module("few_step"), Counter()

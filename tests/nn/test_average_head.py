@@ -101,3 +101,5 @@ def test_a_thin_decoder_has_no_encoder():
     thin = ThinDecoder(latent_channels=4, channels=32, num_res_blocks=0)
     assert thin.decode(torch.randn(1, 4, 2, 4)).shape == (1, 1, 8, 32)
     assert {name.split(".")[0] for name in thin.state_dict()} == {"decoder", "post_quant_conv"}
+    with pytest.raises(ValueError, match="has no encoder: encode with the VAE"):
+        thin.encode(torch.zeros(1, 2, 8, 32))

@@ -106,6 +106,7 @@ def test_inputs_of_another_shape_are_named(network):
         ((latents[..., :6], time), rf"{takes}\(2, 3, {rows}, 6\)"),
         ((latents[:, :2], time), rf"{takes}\(2, 2, {rows}, {columns}\)"),
         ((latents, time[:1]), r"for 1 times, got \(2, .* and times \(1,\)"),
+        ((latents[:1], time[0]), r"for 1 times, got \(1, .* and times \(\)"),
     ):
         with pytest.raises(ValueError, match=message):
             network(*given)

@@ -97,9 +97,10 @@ class BaselineGenerator:
         return self._scenes(latents).range_m
 
     def _scenes(self, latents: Tensor) -> SceneBatch:
-        image = self.baseline.decode(latents).float().clamp(-1, FULL_SCALE)
-        projection, codec = self.geometry.projection, self.geometry.codec
+        image = self.baseline.decode(latents).float()
         finite = image.flatten(1).isfinite().all(dim=1)[:, None, None]
+        image = image.clamp(-1, FULL_SCALE)
+        projection, codec = self.geometry.projection, self.geometry.codec
         range_m = torch.where(finite, codec.ranges_of(image, projection.sensor), torch.nan)
         intensity = (image[:, 1] + 1) / 2 if codec.reflectance else None
         return SceneBatch(range_m, latents, self.calls, projection, intensity)

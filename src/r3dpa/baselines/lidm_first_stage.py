@@ -59,6 +59,8 @@ class LiDMFirstStage(Baseline):
         optimizer: OptimizerConfig = OptimizerConfig(3.6e-5, (0.5, 0.9), 0.0),
         seed: int = 0,
     ) -> None:
+        if mask_factor and not network.mask:
+            raise ValueError(f"mask_factor {mask_factor:g} needs a network with mask: true")
         shape = (network.latent_channels, 1, 1)
         super().__init__(network, shape, optimizer, None, seed)
         with networks_as_settings():

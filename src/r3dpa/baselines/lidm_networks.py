@@ -104,6 +104,7 @@ class VQAutoencoder(VAE):
             deepest = len(self.decoder.get_parameter("conv_in.weight"))
             self.decoder.conv_in = CircularConv2d(outside, deepest, (3, 3))
         self.quantize = Codebook(num_codes, width, legacy_codebook)
+        self.mask = mask
         if mask:
             self.decoder.conv_out = Float32CircularConv2d(channels, 2, (1, 4))
 

@@ -60,6 +60,8 @@ def from_lidm(
     }
     networks, settings = {}, {}
     if "first_stage" in weights:
+        if "ema_network" not in weights:
+            raise ValueError("the file holds no averaged weights (model_ema.*) of LiDM")
         unet, average = weights["network"], weights["ema_network"]
         ours = {key.replace(".", ""): key for key in unet}
         weights["ema_network"] = {ours.get(key, key): value for key, value in average.items()}

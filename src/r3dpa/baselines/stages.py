@@ -47,7 +47,9 @@ def baseline_generator(
             raise ValueError(f"{name} is not for stage {checkpoint.stage}; leave it out")
     if checkpoint.geometry is None:
         raise ValueError(f"{checkpoint.path} does not record which sensor it was trained for")
-    baseline = baseline_of(checkpoint, weights).to(usable_device(device))
+    baseline = baseline_of(checkpoint, weights)
+    baseline.ema = None  # a copy for training
+    baseline.to(usable_device(device))
     geometry = ScanGeometry.from_dict(dict(checkpoint.geometry))
     chosen = sampler or baseline.published
     return BaselineGenerator(baseline, baseline.network, geometry, chosen, **options)

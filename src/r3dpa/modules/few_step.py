@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Self, cast
 
 import torch
 from torch import Tensor, nn
@@ -110,6 +110,13 @@ class FewStep(FlowMatching):
         self.sit.requires_grad_(False)
         sit.average.requires_grad_(True)
         self._cached: CachedTensors[_Noise] | None = None
+        self.vae.eval()
+
+    def train(self, mode: bool = True) -> Self:
+        """Keep the VAE in evaluation mode: in training it decodes leaves otherwise."""
+        super().train(mode)
+        self.vae.eval()
+        return self
 
     def previous_networks(self, before: Checkpoint) -> Checkpoint:
         """The averaged flow as the networks of this stage, with a copy of its last blocks."""

@@ -89,7 +89,6 @@ class UNet(VelocityNetwork):
         self.in_channels = in_channels
         self.channels = channels
         self.grid_size = (rows // reduction, columns // reduction)
-        self.head_channels = head_channels
         self.feature_dim = feature_dim
         self.num_classes = num_classes
 

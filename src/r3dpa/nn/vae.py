@@ -356,6 +356,10 @@ class ThinDecoder(VAE):
         super().__init__(**kwargs)
         self.encoder, self.quant_conv = nn.Identity(), nn.Identity()
 
+    def encode(self, image: Tensor) -> Posterior:
+        """Refused, as there is no encoder."""
+        raise ValueError("a thin decoder has no encoder: encode with the VAE (decoder='full')")
+
 
 class _Encoder(nn.Module):
     def __init__(

@@ -154,10 +154,10 @@ class VelocityNetwork(nn.Module, ABC):
         return torch.zeros(len(time), dtype=torch.long, device=time.device)
 
     def _check(self, latents: Tensor, time: Tensor) -> None:
-        expected = (len(time), self.in_channels, *self.input_size)
+        expected = (time.numel(), self.in_channels, *self.input_size)
         if latents.shape != expected or time.dim() != 1:
             raise ValueError(
-                f"{type(self).__name__} takes latents {expected} for {len(time)} times, got "
+                f"{type(self).__name__} takes latents {expected} for {time.numel()} times, got "
                 f"{tuple(latents.shape)} and times {tuple(time.shape)}"
             )
 
