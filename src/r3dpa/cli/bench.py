@@ -66,8 +66,8 @@ def sampling(
 
     Args:
         out: Folder for table, picture and figures.
-        ckpt: Checkpoint of stage joint or flow_matching, such as ``r3dpa-s``; default: only a
-            mixture of Gaussians whose velocity is exact.
+        ckpt: Checkpoint of stage joint, flow_matching or few_step, such as ``r3dpa-s``; default:
+            only a mixture of Gaussians whose velocity is exact.
         quick: Few scenes, steps and rounds: minutes on a CPU.
         scenes: Scenes of each sampler; default: 256, or 8 with ``--quick``.
         batch_size: Scenes computed together; default: 64 on a GPU, 4 on a CPU.

@@ -104,7 +104,8 @@ def evaluate(
 
     Args:
         samples: File or folder: ``r3dpa sample``, R3DPA, LiDAR-Diffusion, R2DM, R2Flow, RangeLDM,
-            or any clouds as ``.bin``, ``.ply``, ``.txt`` or ``.npz``.
+            or any clouds as ``.bin``, ``.ply``, ``.pcd``, ``.las``, ``.laz``, ``.txt``, ``.npy`` or
+            ``.npz``.
         reference: File of ``r3dpa data reference``, or R3DPA's own ``data_statistics.npy``.
         spaces: Feature spaces; default: all of the reference that need no weights or have them in
             ``ckpt``.

@@ -30,7 +30,7 @@ def gallery(
 
     Args:
         out: HTML file to write.
-        ckpt: Checkpoint of stage joint or flow_matching, a name of ``r3dpa models``, or
+        ckpt: Checkpoint of stage joint, flow_matching or few_step, a name of ``r3dpa models``, or
             ``hf://owner/name``.
         num: Number of scenes.
         data: Training data, a folder of scans or a data YAML; default: no nearest scans.

@@ -19,8 +19,8 @@ class SceneOptions:
     """Checkpoint that generates scenes, and files that they are written to.
 
     Args:
-        ckpt: Checkpoint of stage joint or flow_matching, ``.ckpt`` or exported ``.safetensors``, a
-            name of ``r3dpa models``, or ``hf://owner/name``.
+        ckpt: Checkpoint of stage joint, flow_matching or few_step, or of a baseline, ``.ckpt`` or
+            exported ``.safetensors``; a name of ``r3dpa models``; or ``hf://owner/name``.
         out: Folder for scenes, pictures, page and metadata; must not hold other scenes.
         seed: Scene i depends on (seed, i) alone, not on the batch size.
         batch_size: Scenes generated together.
