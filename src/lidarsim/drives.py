@@ -155,9 +155,9 @@ def simulate(
     if every > 1:
         request["every"] = every
     files = {DriveFiles(out, drive): count for drive, count in counts.items()}
-    holds_more = _check_folder(out, request) and _is_finished(out, files)
+    serves = _check_folder(out, request) and _is_finished(out, files)
     read_only = out.is_dir() and not os.access(out, os.W_OK)
-    if (read_only or holds_more) and not any(d.missing(count) for d, count in files.items()):
+    if (read_only or serves) and not any(d.missing(count) for d, count in files.items()):
         return make_report(_summaries(files), 0)
     out.mkdir(parents=True, exist_ok=True)
     with only_writer(out / ".lock", f"simulates into {out}", wait=True):

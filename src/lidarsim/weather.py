@@ -206,8 +206,8 @@ def recorded_scan(cloud: PointCloud) -> RecordedScan:
 
 def _seconds(cloud: PointCloud) -> NDArray[np.float64] | None:
     """Return times from the first point on; files have them in s, ms, us or ns."""
-    if cloud.time_s is None:
-        return None
+    if cloud.time_s is None or not len(cloud):
+        return cloud.time_s
     elapsed = (cloud.time_s - cloud.time_s.min()).astype(float)
     units = (1.0, 1e-3, 1e-6, 1e-9)
     return elapsed * next((u for u in units if elapsed.max() * u <= _LONGEST_TURN_S), units[-1])

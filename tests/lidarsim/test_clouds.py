@@ -126,6 +126,11 @@ def test_times_are_seconds_whatever_the_unit_of_the_file(unit, kind):
     np.testing.assert_allclose(recorded_scan(cloud).time_s, time_s, atol=1e-6)
 
 
+def test_a_cloud_without_points_says_so():
+    with pytest.raises(ScanError, match=r"points must be \(P, 3\) with at least one point"):
+        recorded_scan(PointCloud.of(np.zeros((0, 3), np.float32), t=[]))
+
+
 NOTHING = [
     *({}, {"visibility_m": math.inf}, {"rain_mm_h": 0.0}, {"snow_mm_h": 0.0}),
     *({"water_film_mm": 0.0, "traffic_m_s": 25.0}, {"sun_elevation_deg": 80.0}),

@@ -131,7 +131,9 @@ def test_walls_are_smoothed_twice_and_other_classes_once():
     classes[:, names.index("building"), :, :32] = 50.0
     classes[:, names.index("vegetation"), :, 32:] = 50.0
     once = without_ripples(without_flying_pixels(image))
+    classes.requires_grad_()
     found = clean_image(image, classes)
+    assert not found.requires_grad
     torch.testing.assert_close(found[..., :32], without_ripples(once)[..., :32])
     torch.testing.assert_close(found[..., 32:], once[..., 32:])
     assert torch.equal(clean_image(image, classes[:, :3]), once)  # of other classes

@@ -30,10 +30,12 @@ class ReconstructionWriter(L.Callback):
     def on_predict_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Refuse scans of equal names, as two data sets may have them: their files would be one."""
         dataset = getattr(cast(Any, trainer).datamodule, "all_set", None)
-        names = Counter(scan.name for scan in dataset.scans) if dataset is not None else Counter()
-        name, count = next(iter(names.most_common(1)), ("", 1))
-        if count > 1:
-            raise ValueError(f"{count} scans have the name {name}: predict each data set by itself")
+        scans = [] if dataset is None else dataset.scans
+        for name, count in Counter(scan.name for scan in scans).items():
+            if count > 1:
+                raise ValueError(
+                    f"{count} scans have the name {name}: predict each data set by itself"
+                )
 
     def on_predict_batch_end(
         self,

@@ -81,7 +81,7 @@ def inpaint(
     if object is not None:
         check_features(shared.ckpt)
         arguments["objects"] = objects = objects or objects_file(shared.ckpt)
-        arguments["sorted_of"] = num  # of more draws, the first ones are others
+        arguments["sorted_of"] = num  # another number of draws is sorted anew
     from r3dpa.editing import EditResult, most_like_first, regions
     from r3dpa.editing.objects import ObjectLibrary
     from r3dpa.scene_files.edits import EditSession

@@ -290,9 +290,7 @@ class LidarDataModule(LoaderModule):
         dataset = self.train_set
         if not len(dataset):
             raise ValueError(f"no scan to train on in {self.scans}: {_EMPTY_SPLIT}")
-        if getattr(self.trainer, "overfit_batches", 0) > 0:
-            return self.loader(dataset, train=False)
-        if not self.augmentation.active and self.weather_prior is None:
+        if self.overfits or (not self.augmentation.active and self.weather_prior is None):
             return self.loader(dataset, train=True)
         drawn = AugmentedDataset(
             dataset, self.augmentation, self.seed, self.grid_size[1], self.weather_prior

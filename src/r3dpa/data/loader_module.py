@@ -28,18 +28,23 @@ class LoaderModule(LightningDataModule):
             "and setup('fit') first"
         )
 
+    @property
+    def overfits(self) -> bool:
+        """Whether the trainer takes the same few batches again and again."""
+        return getattr(self.trainer, "overfit_batches", 0) > 0
+
     def loader(
         self, dataset: Dataset[Any], *, train: bool, kind: str = "scans", **options: Any
     ) -> DataLoader[Any]:
         """Loader as :func:`training_loader`, or of all samples in order.
 
-        In order, and as held-out ones, come training samples under ``overfit_batches`` too. A
-        training set smaller than one batch makes smaller batches, which is said on the screen.
+        Under ``overfit_batches`` training samples come in order too. A training set smaller than
+        one batch makes smaller batches, which is said on the screen.
         """
         trainer = self.trainer
         replicas, rank = (1, 0) if trainer is None else (trainer.world_size, trainer.global_rank)
         options |= worker_options(self.num_workers)
-        if not train or getattr(trainer, "overfit_batches", 0) > 0:
+        if not train or self.overfits:
             options.pop("with_epoch", None)
             # Some samples come twice, so that all processes have as many batches.
             in_order: DistributedSampler[Any] = DistributedSampler(

@@ -366,10 +366,10 @@ def _figure_data(
     places, samples = measured.metrics["matching"].subset("generated")
     _, scans = measured.metrics["matching"].subset("real")
     halves = [metrics_by_name(half) for half in reference.halves]
+    names_of = [reference.names_of_half(index) for index in range(len(halves))]
     scan_names = [
-        names[place]
+        names_of[index][place]
         for index, half in enumerate(halves)
-        for names in [reference.names_of_half(index)]
         for place in half["matching"].subset("real")[0]
     ]
     matches = []

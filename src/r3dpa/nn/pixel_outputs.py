@@ -74,6 +74,7 @@ def clean_image(image: Tensor, classes: Tensor | None = None) -> Tensor:
     """Images without flying pixels and ripples, the latter twice where a decoder sees walls.
 
     Leaves and ground, which one pass leaves about as rough as in scans, are not smoothed further.
+    No gradient reaches the classes.
 
     Args:
         image: As of :func:`without_flying_pixels`.
@@ -83,7 +84,7 @@ def clean_image(image: Tensor, classes: Tensor | None = None) -> Tensor:
     image = without_ripples(without_flying_pixels(image))
     if classes is None or classes.shape[1] != NUM_CLASSES:
         return image
-    walls = classes.softmax(dim=1)[:, _WALLS].sum(dim=1, keepdim=True)
+    walls = classes.detach().softmax(dim=1)[:, _WALLS].sum(dim=1, keepdim=True)
     return torch.lerp(image, without_ripples(image), walls)
 
 
