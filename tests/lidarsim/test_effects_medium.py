@@ -20,7 +20,7 @@ FIXED = {"min_power": 1.43e-5, "min_range_m": 1.45, "overlap_range_m": 5.0}
 SENSOR = replace(hdl64e(shots=360), threshold_spread=0.0, **FIXED)
 WALL = box((31.0, 0, 2), (1, 40, 6), reflectivity=0.6, material=Material.CONCRETE)
 OF_CAR = {"semantic": Semantic.CAR, "instance": 7, "velocity_m_s": (15.0, 0.0)}
-CAR = box((25.0, 1.0, 0.95), (2.0, 0.9, 0.75), reflectivity=0.2, **OF_CAR)
+CAR = box((25.0, 1.0, 0.85), (2.0, 0.9, 0.85), reflectivity=0.2, **OF_CAR)
 # Effect and a weather that calls for it.
 CALLED = (
     (Fog(), Conditions(visibility_m=60)),
@@ -42,7 +42,7 @@ def applied(effect, scene, sensor=SENSOR, before=()):
 
 @pytest.mark.parametrize(("effect", "weather"), CALLED, ids=NAMES)
 def test_echoes_of_the_air_lie_before_the_target_and_second_ones_leave_the_first(effect, weather):
-    scene = Scene((replace(CAR, centre=(16.0, 1.0, 0.95)),), weather=weather)
+    scene = Scene((replace(CAR, centre=(16.0, 1.0, 0.85)),), weather=weather)
     before, after = surfaces(scene), applied(effect, scene)
     dual = applied(effect, scene, before=[DualReturn()])
     for one, two in zip(after.first.columns(), dual.first.columns(), strict=True):
@@ -190,7 +190,7 @@ def test_the_echo_of_a_drop_is_weakened_there_and_back():
 
 def test_plume_of_a_car():
     """A car of 1.8 m width at 15 m/s, rear at x = 14 m: the plume spans 5..14 m, |y - 1| < 0.9."""
-    scene = Scene((replace(CAR, centre=(16.0, 1.0, 0.95)),), weather=Conditions(water_film_mm=1.2))
+    scene = Scene((replace(CAR, centre=(16.0, 1.0, 0.85)),), weather=Conditions(water_film_mm=1.2))
     sensor = replace(SENSOR, spin_hz=1e6)  # no time for the car to move
     before, after = surfaces(scene, sensor), applied(Spray(), scene, sensor)
     # Rays at the car's rear have 9 m of spray with 0.2 * 0.5 per metre before them.
@@ -208,7 +208,7 @@ def test_plume_of_a_car():
     assert np.abs(y - 1).max() < 0.91
     assert z.max() < 1.8 - 1.73 + 0.01
     # A car that leaves to the left leaves its plume to the right of it.
-    car = replace(CAR, centre=(15.0, 10.0, 0.95), yaw_rad=math.pi / 2, velocity_m_s=(0.0, 15.0))
+    car = replace(CAR, centre=(15.0, 10.0, 0.85), yaw_rad=math.pi / 2, velocity_m_s=(0.0, 15.0))
     after = applied(Spray(), replace(scene, primitives=(car,)), sensor)
     x, y, _ = after.position(np.flatnonzero(after.first.origin == Origin.SPRAY))
     assert (y.min() > -1.01) & (y.max() < 8.01)
@@ -217,7 +217,7 @@ def test_plume_of_a_car():
 
 def test_one_plume_per_vehicle():
     roof = replace(CAR, centre=(25.0, 1.0, 2.0), half_size=(1.0, 0.8, 0.3))
-    beside = replace(CAR, centre=(25.0, -3.0, 0.95), instance=0)
+    beside = replace(CAR, centre=(25.0, -3.0, 0.85), instance=0)
     wet = Conditions(water_film_mm=1.2)
     one = applied(Spray(), Scene((CAR,), weather=wet))
     same = applied(Spray(), Scene((CAR, roof), weather=wet))
@@ -225,6 +225,14 @@ def test_one_plume_per_vehicle():
     sprayed = [(sweep.first.origin == Origin.SPRAY).sum() for sweep in (one, same, two)]
     assert sprayed[1] == pytest.approx(sprayed[0], abs=5)  # the roof hides some ground behind it
     assert sprayed[2] > 1.5 * sprayed[0]
+
+
+def test_a_plume_is_the_same_behind_a_car_whose_wheels_are_cast_and_one_far_away():
+    wheels = replace(CAR, centre=(25.0, 1.0, 0.31), half_size=(0.31, 0.9, 0.31))
+    wet = Conditions(water_film_mm=1.2)
+    near, far = Scene((CAR, wheels), weather=wet), Scene((CAR,), weather=wet, unseen=(wheels,))
+    sprayed = [Spray().rays(Sweep(scene, SENSOR)) for scene in (near, far)]
+    np.testing.assert_array_equal(*sprayed)
 
 
 def test_slow_vehicles_and_dry_roads_spray_nothing():
@@ -235,7 +243,7 @@ def test_slow_vehicles_and_dry_roads_spray_nothing():
 
 def test_plume_moves_with_its_car():
     """Seen from a car at 40 m/s that passes on the left, 25 ms after the middle of the sweep."""
-    car = replace(CAR, centre=(8.0, 5.0, 0.95), velocity_m_s=(40.0, 0.0))
+    car = replace(CAR, centre=(8.0, 5.0, 0.85), velocity_m_s=(40.0, 0.0))
     after = applied(Spray(), Scene((car,), weather=Conditions(water_film_mm=1.2)))
     spray = np.flatnonzero(after.first.origin == Origin.SPRAY)
     x = after.position(spray)[0]

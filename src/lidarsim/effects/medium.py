@@ -33,8 +33,6 @@ _BACKSCATTER = 0.046 / math.log(20)
 _FOG_STEP_M = 0.05
 _FAST_M_S = 10.0
 _PLUME_S, _PLUME_MAX_M, _PLUME_HEIGHT_M = 0.6, 12.0, 1.8
-# Undersides of vehicles lie about this much above the road.
-_CLEARANCE_M = 0.2
 # Grid of the table of drops and flakes.
 _DROP_STEP_M, _DROP_POWERS = 0.2, 64
 
@@ -126,9 +124,9 @@ def soft_waveform(
 class Spray(Effect):
     """Plumes of droplets behind fast vehicles on a wet road.
 
-    The plume is a box from the rear of the vehicle, as wide as the vehicle, 1.8 m high from the
-    road, and as long as the path of the last 0.6 s, at most 12 m. With the speed v and the depth w
-    of the water, its extinction is::
+    The plume is a box from the rear of the vehicle, as wide as the vehicle, 1.8 m high from
+    its lowest part, and as long as the path of the last 0.6 s, at most 12 m. With the speed v and
+    the depth w of the water, its extinction is::
 
         extinction = max_extinction * clip((v - 10 m/s) / 10 m/s, 0, 1) * clip(w / 1.2 mm, 0, 1)
 
@@ -189,10 +187,13 @@ class Spray(Effect):
 
 
 def _plumes(scene: Scene) -> tuple[Primitive, ...]:
-    """One box behind each fast vehicle, in the world frame; none on a dry road."""
+    """One box behind each fast vehicle, in the world frame; none on a dry road.
+
+    Wheels and mirrors count even if they are too far away to be cast.
+    """
     vehicles = defaultdict(list)
     if scene.weather.water_film_mm > 0:
-        for index, primitive in enumerate(scene.primitives):
+        for index, primitive in enumerate((*scene.primitives, *scene.unseen)):
             if math.hypot(*primitive.velocity_m_s) > _FAST_M_S:
                 # Solids that belong to no object are vehicles of their own.
                 vehicles[primitive.instance or -1 - index].append(primitive)
@@ -215,7 +216,7 @@ def _plume(parts: list[Primitive]) -> Primitive:
         right, left = min(right, aside - reach_aside), max(left, aside + reach_aside)
     length = min(_PLUME_S * speed, _PLUME_MAX_M)
     along, aside = rear - length / 2, (left + right) / 2
-    road_m = min(part.centre[2] - part.half_size[2] for part in parts) - _CLEARANCE_M
+    road_m = min(part.centre[2] - part.half_size[2] for part in parts)
     x, y = along * ahead_x - aside * ahead_y, along * ahead_y + aside * ahead_x
     centre = (x, y, road_m + _PLUME_HEIGHT_M / 2)
     half_size = (length / 2, (left - right) / 2, _PLUME_HEIGHT_M / 2)

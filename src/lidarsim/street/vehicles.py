@@ -303,6 +303,7 @@ def truck(draw: Generator) -> Body:
         _pane(front_m + 0.03, 2.2, (0.03, 0.88 * width, 0.9), Semantic.TRUCK),
         _painted(Semantic.TRUCK, 0.05)((-cab_m / 2, 0, 0.75), (length - cab_m, 1.9, 0.5)),
         load,
+        *_wheels(Semantic.TRUCK, width - 0.1, front_m - 1.2, 1.6 - front_m),
         _plate(-front_m, 0.8, Semantic.TRUCK),
     )
 
@@ -315,6 +316,7 @@ def bus(draw: Generator) -> Body:
     return (
         painted((0, 0, 0.8), (length, width, 1.0)),
         *_cabin(draw, 0, 1.975, (length - 0.1, width - 0.06, 1.35), roof),
+        *_wheels(Semantic.BUS, width, length / 2 - 2.7, 3.2 - length / 2),
         _plate(-length / 2, 0.6, Semantic.BUS),
     )
 
