@@ -17,7 +17,7 @@ from lidarsim.effects import (
 )
 from lidarsim.scan import simulate_scan
 from lidarsim.scene import EgoMotion, Material, Pose, Primitive, Scene, Semantic, Shape
-from lidarsim.sensors import hdl64e
+from lidarsim.sensors import hdl64e, load_sensor
 from lidarsim.solids import EGO_BODY
 from lidarsim.street.vehicles import recording_car
 from lidarsim.sweep import Origin, Sweep
@@ -180,3 +180,14 @@ def test_share_of_shots_that_the_recording_car_hides():
     hidden.reshape(-1)[EgoOcclusion().rays(Sweep(scene, sensor))] = True
     assert hidden.mean() == pytest.approx(0.064, abs=0.004)
     assert not hidden[:41].any()
+
+
+@pytest.mark.parametrize("name", ["hdl64e", "hdl32e", "os1_64"])
+def test_shots_that_the_recording_car_hides_are_lost(name):
+    sensor = load_sensor(name)
+    scene = Scene(room(), ego_body=recording_car())
+    hidden = EgoOcclusion().rays(Sweep(scene, sensor))
+    scan = simulate_scan(scene, sensor, (0,))
+    assert len(hidden) > 1000
+    assert not (scan.labels == Semantic.EGO_VEHICLE).any()
+    assert len(scan.points) <= sensor.num_beams * sensor.shots - len(hidden)
