@@ -156,7 +156,7 @@ def test_traffic_keeps_clear_of_the_recording_car():
                 assert not inside(p, points).any(), (key, p)
 
 
-def test_no_car_stands_in_a_building():
+def test_no_car_stands_in_a_building_or_a_garage():
     corners = np.array([[a, b, 0] for a in (1, -1) for b in (1, -1)]) * 0.95
     cars = 0
     for key, scene in list(many_scenes().items())[::3]:
@@ -165,10 +165,68 @@ def test_no_car_stands_in_a_building():
         for p in bodies:
             points += [*(turned(corners * p.half_size, p.yaw_rad) + p.centre), p.centre]
         for wall in scene.primitives:
-            if wall.semantic == Semantic.BUILDING and wall.material != Material.GLASS:
+            built = wall.semantic in (Semantic.BUILDING, Semantic.GARAGE)
+            if built and wall.material != Material.GLASS:
                 assert not inside(wall, points).any(), (key, wall)
         cars += len(bodies)
     assert cars > 800
+
+
+def test_nobody_walks_through_things():
+    for key, scene in list(many_scenes().items())[::3]:
+        solids = (*scene.primitives, *scene.unseen)
+        moving = [p for p in solids if p.semantic == Semantic.PERSON and any(p.velocity_m_s)]
+        trunks = [p.centre for p in moving]
+        for p in solids:
+            if not (any(p.velocity_m_s) or p.extinction_per_m or p.semantic in GROUND):
+                assert not trunks or not inside(p, trunks).any(), (key, p)
+
+
+def test_no_lane_leads_through_a_traffic_island():
+    islands = 0
+    for drive in range(40):
+        course = course_of(0, drive)
+        streams = street_module._streams(0, drive)
+        lanes = [s.lateral_m for s in streams if s.kind is street_module.vehicle]
+        for block in range(0, 4 * course.crossing_every, course.crossing_every):
+            section = course.section_of(block)
+            wheels = [
+                np.add(
+                    section.at(s, lateral + side),
+                    (0, 0, course.surface_m(lateral + side) + 0.02),
+                )
+                for s in np.arange(block * BLOCK_M, (block + 1) * BLOCK_M, 0.5)
+                for lateral in lanes
+                for side in (-1.25, 1.25)  # half a bus
+            ]
+            for p in street_module._block(0, drive, block).primitives:
+                if p.semantic == Semantic.SIDEWALK and p.half_size[1] < 0.5:
+                    assert not inside(p, wheels).any(), (drive, block)
+                    islands += 1
+    assert islands > 20
+
+
+def test_cars_parked_in_side_streets_stand_on_the_road():
+    parked = 0
+    for drive in range(7):
+        every = course_of(0, drive).crossing_every
+        for block in range(0, 12 * every, every):
+            builder = street_module._block(0, drive, block)
+            across = builder.section.heading_rad + np.array([-math.pi / 2, math.pi / 2])
+            roads = [p for p in builder.primitives if p.semantic == Semantic.ROAD]
+            for p in builder.details:
+                # Cars on plots stand at right angles to the street too, but not exactly.
+                if p.semantic != Semantic.CAR or np.abs(across - p.yaw_rad).min() > 1e-9:
+                    continue
+                x, y, z = p.centre
+                heights = [top_at(road, x, y) for road in roads]
+                roads_below = [
+                    inside(r, [(x, y, h - 0.1)])[0] for r, h in zip(roads, heights, strict=True)
+                ]
+                above_m = z - p.half_size[2] - max(np.array(heights)[roads_below])
+                assert above_m > -0.001  # wheels, the lowest parts, stand on the road
+                parked += above_m < 0.001
+    assert parked > 40
 
 
 def test_actors_move_as_their_velocity_says():
@@ -287,3 +345,11 @@ def test_a_pavement_lies_a_kerb_above_the_gutter_and_a_verge_begins_level_with_i
     np.testing.assert_allclose(steps[True], 1.0, atol=1e-3)
     np.testing.assert_allclose(steps[False], 0.0, atol=1e-3)
     assert min(map(len, steps.values())) > 3
+
+
+def test_the_ground_beyond_a_pavement_rises_or_falls_as_its_slope_says():
+    for drive in range(20):
+        course = course_of(0, drive)
+        for lateral in (-20.0, 20.0):
+            rise = course.surface_m(lateral + 0.5) - course.surface_m(lateral - 0.5)
+            assert course.surface_cross(lateral) == pytest.approx(rise)

@@ -19,6 +19,8 @@ Place = tuple[float, float]
 
 _TERRAIN_M = 48.0
 _SLAB_M = 1.0
+# Above a walkway.
+_HEADROOM_M = 2.0
 
 
 class Strip(NamedTuple):
@@ -94,11 +96,20 @@ class Builder:
         )  # fmt: skip
 
     def body(
-        self, body: Body, at: Place, yaw_rad: float, instance: int, speed_m_s: float = 0.0
+        self,
+        body: Body,
+        at: Place,
+        yaw_rad: float,
+        instance: int,
+        speed_m_s: float = 0.0,
+        sunk_m: float = 0.0,
     ) -> None:
-        """Add a vehicle or a person at (s, lateral), which moves along its heading."""
+        """Add a vehicle or a person at (s, lateral), which moves along its heading.
+
+        ``sunk_m``: of the ground there below the surface of the street, as of ``slab``.
+        """
         x, y, z = self.section.at(*at)
-        z += self.course.surface_m(at[1])
+        z += self.course.surface_m(at[1]) - sunk_m
         heading = self.section.heading_rad + yaw_rad
         cosine, sine = math.cos(heading), math.sin(heading)
         cross = self.section.cross + self.course.surface_cross(at[1])
@@ -147,6 +158,38 @@ class Builder:
             )
         )  # fmt: skip
 
+    def clear_walkway(self, side: float) -> None:
+        """Remove objects and parts of buildings that people would walk through; leaves stay."""
+        solids = (*self.primitives, *self.details)
+        in_the_way = [p for p in solids if p.instance and self._on_walkway(p, side)]
+        parts = {p for p in in_the_way if p.semantic == Semantic.BUILDING}
+        objects = {p.instance for p in in_the_way} - {p.instance for p in parts}
+        # The plant of a tub is an object of its own at the same place.
+        places = {p.centre[:2] for p in in_the_way}
+
+        def stays(p: Primitive) -> bool:
+            return not (p in parts or p.instance in objects or p.centre[:2] in places)
+
+        self.primitives = [p for p in self.primitives if stays(p)]
+        self.details = [p for p in self.details if stays(p)]
+
+    def _on_walkway(self, solid: Primitive, side: float) -> bool:
+        """Whether a solid without leaves reaches into the walkway, less than 2 m above it."""
+        near_m, far_m = self.course.walkway_m(side)
+        section, turn = self.section, solid.yaw_rad - self.section.heading_rad
+        x, y = solid.centre[0] - section.x_m, solid.centre[1] - section.y_m
+        cosine, sine = math.cos(section.heading_rad), math.sin(section.heading_rad)
+        along, away_m = x * cosine + y * sine, side * (y * cosine - x * sine)
+        half_long, half_wide, half_tall = solid.half_size
+        reach_m = abs(half_long * math.sin(turn)) + abs(half_wide * math.cos(turn))
+        ground_m = section.on_chord(along, side * away_m)[2] + self.course.surface_m(side * away_m)
+        return (
+            solid.material != Material.FOLIAGE
+            and near_m < away_m + reach_m
+            and away_m - reach_m < far_m
+            and solid.centre[2] - half_tall < ground_m + _HEADROOM_M
+        )
+
     def puddle(self, draw: Generator, s: float, lateral: float) -> None:
         """Add a place of standing water on a wet road."""
         x, y, _ = self.section.at(s, lateral)
@@ -160,8 +203,8 @@ def _turned(slopes: tuple[float, float], yaw_rad: float) -> tuple[float, float]:
     return cosine * along + sine * across, cosine * across - sine * along
 
 
-def build_ground(builder: Builder, draw: Generator, side: float, opening: bool) -> None:
-    """Roadway, pavement or verge, and terrain; with the opening of a side street."""
+def build_ground(builder: Builder, draw: Generator, side: float, opening_m: float) -> None:
+    """Roadway, pavement or verge, terrain; and a side street, ``opening_m`` wide (0: none)."""
     course, whole = builder.course, (0.0, BLOCK_M)
     edge_m, pavement_m = course.kerb(side).edge_m, course.kerb(side).pavement_m
     asphalt = (Semantic.ROAD, Material.ASPHALT, course.road_reflectivity)
@@ -173,9 +216,8 @@ def build_ground(builder: Builder, draw: Generator, side: float, opening: bool) 
     pavement = (side * edge_m, side * (edge_m + pavement_m))
     beyond = (pavement[1], side * (edge_m + _TERRAIN_M))
     strips = (pavement, beyond) if pavement_m else (beyond,)
-    if opening:
-        half_m = draw.uniform(2.8, 4.2)
-        near, far = (0.0, BLOCK_M / 2 - half_m), (BLOCK_M / 2 + half_m, BLOCK_M)
+    if opening_m:
+        near, far = (0.0, (BLOCK_M - opening_m) / 2), ((BLOCK_M + opening_m) / 2, BLOCK_M)
         for strip in strips:
             builder.slab((near[1], far[0]), strip, *asphalt, course.step_up_m(side))
             builder.slab(near, strip, *paving)

@@ -178,14 +178,14 @@ def garage(builder: Builder, draw: Generator, s: float, front_m: float, side: fl
 
 
 def carport(builder: Builder, draw: Generator, s: float, front_m: float, side: float) -> None:
-    """A roof on four to six posts; the car below it is not part of it."""
+    """A roof on six posts, over a caravan if need be; what stands below it is not part of it."""
     look = (Semantic.GARAGE, Material.WOOD, 0.15, builder.new_instance())
     for away_m in (0.0, 2.5, 5.0):
         for along_m in (-1.5, 1.5):
             at = (s + along_m, side * (front_m + away_m))
-            builder.solid(Shape.BOX, at, (0.12, 0.12, 2.4 + FOOTING_M), *look, -FOOTING_M)
+            builder.solid(Shape.BOX, at, (0.12, 0.12, 2.9 + FOOTING_M), *look, -FOOTING_M)
     roof = (3.4, 5.6, 0.2)
-    builder.solid(Shape.BOX, (s, side * (front_m + 2.5)), roof, *look, 2.3)
+    builder.solid(Shape.BOX, (s, side * (front_m + 2.5)), roof, *look, 2.8)
 
 
 def shed(builder: Builder, draw: Generator, s: float, lateral: float) -> None:

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lidarsim.draws import generator_for
+from lidarsim.scene import Interval
 
 #: The street is built block by block of this length.
 BLOCK_M = 24.0
@@ -20,7 +21,12 @@ _CAMBER = 0.02
 # Lanes and pavements of German residential streets.
 _LANE_M, _PAVEMENT_M = (2.75, 3.25), (1.6, 3.2)
 _GUTTER_M = (0.5, 0.9)
-_PARKING_M = 2.1
+#: Width of the places for parked cars.
+PARKING_M = 2.1
+# Between the lanes of both directions on roads with traffic islands.
+_MEDIAN_M = 1.4
+# People walk between these distances from the plots.
+_WALKWAY_M = (1.1, 0.1)
 # Bins are emptied on one working day of five.
 _COLLECTION_DAYS = 0.2
 _RISE = (-0.022, 0.03)
@@ -41,7 +47,7 @@ class Character(NamedTuple):
     houses, houses, blocks of flats, green, yards and fields. ``parked``: share of taken places.
     ``parking``, ``pavement``: chance. ``clutter``: mean number of small things on 24 m of
     pavement. ``people``: chance of people who stand there. ``lights``: whether crossings have
-    traffic lights. ``island``: chance of a traffic island at a crossing.
+    traffic lights. ``island``: chance of a median with traffic islands at its crossings.
 
     Shares of parked cars and clutter were chosen for the depth edges of recorded streets, see
     ``tests/bench/street_fullness.py``.
@@ -154,6 +160,7 @@ class Course(NamedTuple):
     character: Character
     lane_m: float
     lanes: tuple[int, int]
+    median_m: float  # between the lanes of both directions, 0 without traffic islands
     ego_lane: int
     kerbs: tuple[Kerb, Kerb]  # right, left
     kerb_m: float
@@ -175,11 +182,21 @@ class Course(NamedTuple):
     @property
     def ego_lateral_m(self) -> float:
         """Lateral distance of the recording car from the axis; it drives on the right."""
-        return -(self.ego_lane + 0.5) * self.lane_m
+        return -self.lane_lateral_m(self.ego_lane)
+
+    def lane_lateral_m(self, lane: int) -> float:
+        """Distance of the middle of a lane from the axis; lane 0 is the innermost."""
+        return self.median_m / 2 + (lane + 0.5) * self.lane_m
 
     def kerb(self, side: float) -> Kerb:
         """The right (-1) or left (1) side of the road."""
         return self.kerbs[1 if side > 0 else 0]
+
+    def walkway_m(self, side: float) -> Interval:
+        """Distances from the axis between which people walk on the pavement of one side."""
+        kerb = self.kerb(side)
+        far_m = kerb.edge_m + kerb.pavement_m
+        return far_m - _WALKWAY_M[0], far_m - _WALKWAY_M[1]
 
     def step_up_m(self, lateral: float) -> float:
         """Height of the kerb on one side of the road; a verge begins without one."""
@@ -203,7 +220,7 @@ class Course(NamedTuple):
             return math.copysign(_CAMBER, -lateral)
         if abs(lateral) < kerb.edge_m + kerb.pavement_m:
             return 0.0
-        return math.copysign(kerb.rise, lateral)
+        return kerb.rise * math.copysign(1.0, lateral)
 
     def _moving(self, scan: int) -> tuple[int, bool]:
         """Number of earlier scans in which the car moved, and whether it waits in this one."""
@@ -257,12 +274,14 @@ def course_of(seed: int, drive: int) -> Course:
     character = CHARACTERS[(drive + seed) % len(CHARACTERS)]
     lane_m = draw.uniform(*_LANE_M)
     lanes = character.lanes[int(draw.integers(len(character.lanes)))]
+    has_islands = lanes[1] > 0 and draw.random() < character.island
+    median_m = _MEDIAN_M if has_islands else 0.0
     kerbs = []
     for count in lanes:
         parking = bool(draw.random() < character.parking)
-        lanes_m = count * lane_m + draw.uniform(*_GUTTER_M)
+        lanes_m = median_m / 2 + count * lane_m + draw.uniform(*_GUTTER_M)
         pavement_m = draw.uniform(*_PAVEMENT_M) if draw.random() < character.pavement else 0.0
-        edge_m, rise = lanes_m + parking * _PARKING_M, draw.uniform(*_RISE)
+        edge_m, rise = lanes_m + parking * PARKING_M, draw.uniform(*_RISE)
         kerbs.append(Kerb(lanes_m, edge_m, pavement_m, parking, rise))
     period = draw.uniform(40.0, 90.0)
     # Sums of two waves: (amplitude, length, phase) of the heading and of the slope.
@@ -276,6 +295,7 @@ def course_of(seed: int, drive: int) -> Course:
         character=character,
         lane_m=lane_m,
         lanes=lanes,
+        median_m=median_m,
         ego_lane=int(draw.integers(lanes[0])),
         kerbs=(kerbs[0], kerbs[1]),
         kerb_m=draw.uniform(0.08, 0.15),

@@ -206,13 +206,13 @@ def planter(builder: Builder, draw: Generator, s: float, lateral: float) -> None
 
 
 def bicycles(builder: Builder, draw: Generator, s: float, lateral: float) -> None:
-    """One bicycle along the kerb, or a row of them across the pavement at stands."""
+    """One bicycle along the kerb, or a row of them aslant at stands."""
     if draw.random() < 0.5:
         turn = draw.choice((0.0, math.pi)) + draw.normal(0, 0.1)
         builder.body(bicycle(draw), (s, lateral), turn, builder.new_instance())
         return
     pitch_m = draw.uniform(*_STAND_PITCH_M)
-    turn = draw.choice((1.0, 0.6)) * math.pi / 2
+    turn = draw.choice((0.6, 0.4)) * math.pi / 2
     stands = (Semantic.SMALL_POLE, *_STEEL)
     for place in range(int(draw.integers(3, 8))):
         at = (s + pitch_m * place, lateral)

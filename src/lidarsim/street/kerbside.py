@@ -8,7 +8,7 @@ from numpy.random import Generator
 
 from lidarsim.scene import Material, Semantic, Shape
 from lidarsim.street.builder import Builder
-from lidarsim.street.course import BLOCK_M
+from lidarsim.street.course import BLOCK_M, PARKING_M
 from lidarsim.street.furniture import (
     bicycles,
     bins,
@@ -29,10 +29,11 @@ from lidarsim.street.vehicles import motorcycle, parked_vehicle
 _STREET_TREES = (0.4, 0.9)
 # Places for parked cars, every 5.5 to 7 m; in the rows here 6 m.
 _PARKING_PLACE_M = 6.0
-# From the kerb, metres: posts and lamps stand near it, clutter anywhere up to the plots.
-_POST_M, _CLUTTER_M = 0.45, 0.3
-# Length and width of a traffic island; lanes leave it 1 m. Reflectivity of its kerbstones.
-_ISLAND_M, _KERBSTONE = (3.0, 0.7), 0.18
+# From the kerb, metres: posts and lamps, the nearest clutter, and trees. Half a thing of clutter.
+_POST_M, _CLUTTER_M, _TREE_M, _HALF_M = 0.38, 0.3, 0.6, 0.35
+# Length and width of a traffic island, and its distance from a side street's middle: before the
+# crossing. Reflectivity of its kerbstones.
+_ISLAND_M, _TO_CROSSING_M, _KERBSTONE = (3.0, 0.7), 7.5, 0.18
 
 
 def build_kerbside(builder: Builder, draw: Generator, side: float, district: Generator) -> None:
@@ -51,7 +52,7 @@ def build_kerbside(builder: Builder, draw: Generator, side: float, district: Gen
         sign(builder, draw, start + draw.uniform(0, BLOCK_M), by_kerb, side)
     if draw.random() < tree_share:
         for s in (start + draw.uniform(2, 9), start + draw.uniform(13, 21)):
-            street_tree(builder, draw, s, side * (kerb.edge_m + 0.9))
+            street_tree(builder, draw, s, side * (kerb.edge_m + _TREE_M))
     if kerb.pavement_m:
         _pavement(builder, draw, side)
     elif draw.random() < 0.4:
@@ -65,7 +66,7 @@ def _parked_row(builder: Builder, draw: Generator, side: float, share: float) ->
         s = start + _PARKING_PLACE_M * (place + 0.5) + draw.uniform(-0.25, 0.25)
         if draw.random() < share:
             yaw_rad = draw.normal(0.0, 0.02) + (math.pi if side > 0 else 0.0)
-            at = (s, side * (edge_m - 1.05 + draw.normal(0, 0.06)))
+            at = (s, side * (edge_m - PARKING_M / 2 + draw.normal(0, 0.06)))
             builder.body(parked_vehicle(draw), at, yaw_rad, builder.new_instance())
 
 
@@ -73,13 +74,12 @@ def _pavement(builder: Builder, draw: Generator, side: float) -> None:
     """Clutter and people on the pavement, by how busy the surroundings are."""
     kerb, character = builder.course.kerb(side), builder.course.character
     start = builder.section.block * BLOCK_M
-    near_m, far_m = kerb.edge_m + _CLUTTER_M, kerb.edge_m + kerb.pavement_m
+    near_m = kerb.edge_m + _CLUTTER_M
+    far_m = max(near_m, builder.course.walkway_m(side)[0] - _HALF_M)
 
     def somewhere() -> tuple[float, float]:
-        """On the near or the far third of the pavement: the middle is left free to walk."""
-        third_m = (far_m - near_m) / 3
-        away_m = draw.uniform(0, third_m) + (2 * third_m if draw.random() < 0.5 else 0.0)
-        return start + draw.uniform(1, BLOCK_M - 1), side * (near_m + away_m)
+        """Between kerb and walkway; what yet reaches into the walkway is removed later."""
+        return start + draw.uniform(1, BLOCK_M - 1), side * draw.uniform(near_m, far_m)
 
     for _ in range(int(draw.poisson(character.clutter))):
         clutter(builder, draw, *somewhere())
@@ -92,9 +92,9 @@ def _pavement(builder: Builder, draw: Generator, side: float) -> None:
         first = start + draw.uniform(1, 10)
         bollards(builder, draw, first, first + draw.uniform(4, 12), side * (kerb.edge_m + 0.3))
     if draw.random() < 0.15:
-        cabinet(builder, draw, start + draw.uniform(1, 23), side * (far_m - 0.25))
+        cabinet(builder, draw, *somewhere())
     if draw.random() < 0.05 and kerb.pavement_m > 2.0:
-        bus_stop(builder, draw, start + draw.uniform(5, 19), side * (kerb.edge_m + 1.2), side)
+        bus_stop(builder, draw, start + draw.uniform(5, 19), side * (kerb.edge_m + 1.0), side)
     if draw.random() < character.people:
         group(builder, draw, *somewhere())
     if builder.course.collection_day:
@@ -119,13 +119,11 @@ def build_corner(builder: Builder, draw: Generator, side: float) -> None:
 
 
 def build_island(builder: Builder, draw: Generator) -> None:
-    """A traffic island with a sign between the lanes of both directions, before a crossing."""
+    """Traffic islands with signs in the median, before and behind a crossing."""
     course = builder.course
-    if not course.lanes[1] or draw.random() > course.character.island:
-        return
-    start = builder.section.block * BLOCK_M
+    middle = (builder.section.block + 0.5) * BLOCK_M
     stone = (Semantic.SIDEWALK, Material.CONCRETE, _KERBSTONE)
-    for s in (start + 1.5, start + BLOCK_M - 1.5):
+    for s in (middle - _TO_CROSSING_M, middle + _TO_CROSSING_M):
         size = (_ISLAND_M[0], _ISLAND_M[1], course.kerb_m + 0.2)
         builder.solid(Shape.BOX, (s, 0.0), size, *stone, bottom_m=-0.2, inclined=True)
         sign(builder, draw, s, 0.0, -1.0)

@@ -13,15 +13,15 @@ from numpy.random import Generator
 from lidarsim.scene import Material, Semantic
 from lidarsim.street.builder import Builder, Strip
 from lidarsim.street.buildings import Front, building, carport, garage, hall, row_houses, shed
-from lidarsim.street.course import BLOCK_M
+from lidarsim.street.course import BLOCK_M, PARKING_M
 from lidarsim.street.furniture import bicycles, bins, poster
 from lidarsim.street.gardens import border, fence, front_garden, hedge, shrub, verge
 from lidarsim.street.trees import garden_tree, meadow, wood_edge
 from lidarsim.street.vehicles import parked_vehicle
 from lidarsim.street.works import building_site, scaffolding
 
-# A drive beside a house, wide enough for a garage.
-_DRIVE_M = 4.0
+# A drive beside a house, wide enough for a garage, and long enough for a van before it.
+_DRIVE_M, _DRIVE_LONG_M = 4.0, 8.6
 # Metres of street per tree behind the houses.
 _BACK_TREE_M = 4.0
 # Trees in the front garden of a detached house, on average.
@@ -51,12 +51,12 @@ def _town(builder: Builder, draw: Generator, start: float, side: float, edge_m: 
             front_m = edge_m + draw.uniform(0.0, 0.8)
             front = Front(side, s, last, front_m)
             building(builder, draw, front, draw.uniform(8, 12), 12.0)
-            if draw.random() < 0.06:
-                scaffolding(builder, draw, front, 6.0)
         elif kind < 0.85:
             front_m = edge_m + draw.uniform(2.0, 4.5)
             front = Front(side, s, last, front_m)
             building(builder, draw, front, draw.uniform(8, 12), 10.0)
+            if draw.random() < 0.08:
+                scaffolding(builder, draw, front, 6.0)
             border(builder, draw, side * (edge_m + 0.4), s, last)
             front_garden(builder, draw, Strip(side, s, last, edge_m + 0.8, front_m))
         else:
@@ -121,7 +121,7 @@ def _houses(builder: Builder, draw: Generator, start: float, side: float, edge_m
     # Beside the house one looks between the plots into the gardens behind.
     for gap_first, gap_last in ((plot, first), (first + wide_m, plot_end)):
         _side_garden(builder, draw, side, gap_first, gap_last, front_m)
-    _drive(builder, draw, drive_s, side, edge_m, setback_m)
+    _drive(builder, draw, drive_s, side, edge_m)
     if draw.random() < 0.8:
         _behind(builder, draw, start, side * (edge_m + draw.uniform(15, 23)), 0.95)
 
@@ -145,13 +145,11 @@ def _side_garden(
         garden_tree(builder, draw, draw.uniform(first, last), at)
 
 
-def _drive(
-    builder: Builder, draw: Generator, s: float, side: float, edge_m: float, setback_m: float
-) -> None:
+def _drive(builder: Builder, draw: Generator, s: float, side: float, edge_m: float) -> None:
     """A drive that ends at a garage, a carport or in the garden, sometimes with a car on it."""
     kind = draw.random()
     if kind < 0.45:
-        garage(builder, draw, s, edge_m + max(setback_m, 5.5), side)
+        garage(builder, draw, s, edge_m + _DRIVE_LONG_M, side)
     elif kind < 0.65:
         carport(builder, draw, s, edge_m + 5.5, side)
     else:
@@ -262,7 +260,7 @@ def _car_in_plot(builder: Builder, draw: Generator, s: float, side: float, edge_
     builder.body(parked_vehicle(draw), at, yaw_rad, builder.new_instance())
 
 
-def build_side_street(builder: Builder, draw: Generator, side: float) -> None:
+def build_side_street(builder: Builder, draw: Generator, side: float, opening_m: float) -> None:
     """Houses and gardens around the corners of a side street, its parked cars, and its end."""
     start = builder.section.block * BLOCK_M
     kerb = builder.course.kerb(side)
@@ -288,7 +286,10 @@ def build_side_street(builder: Builder, draw: Generator, side: float) -> None:
                 shrub(builder, draw, at, side * (edge_m + away_m + draw.uniform(0, 6)))
     for place in range(4):
         if draw.random() < 0.45:
-            place_of_car = (middle - 3.6, side * (edge_m + 7 + 6.0 * place))
+            place_of_car = (middle - (opening_m - PARKING_M) / 2, side * (edge_m + 7 + 6.0 * place))
             yaw_rad = draw.choice((-1, 1)) * math.pi / 2
-            builder.body(parked_vehicle(draw), place_of_car, yaw_rad, builder.new_instance())
+            sunk_m = builder.course.step_up_m(side)
+            builder.body(
+                parked_vehicle(draw), place_of_car, yaw_rad, builder.new_instance(), sunk_m=sunk_m
+            )
     _behind(builder, draw, start, side * (edge_m + 56), 0.8)

@@ -36,6 +36,8 @@ _BLOCKS_BEHIND, _BLOCKS_AHEAD = 3, 3
 _DETAIL_M = 25.0
 # One character of the surroundings (town, houses, ...) per side lasts this many blocks.
 _BLOCKS_PER_DISTRICT = 6
+# Width of the roadway of a side street.
+_SIDE_STREET_M = (5.6, 8.4)
 # Weather lasts this many scans.
 _SCANS_PER_WEATHER = 100
 # A day of driving; the course of a drive is followed from its start.
@@ -138,15 +140,18 @@ def _block(seed: int, drive: int, block: int) -> Builder:
     for side in (1.0, -1.0):
         stretch = block // _BLOCKS_PER_DISTRICT
         district = generator_for(seed, "district", drive, stretch, int(side > 0))
-        opening = bool(crosses and only_side in (0.0, side))
-        build_ground(builder, draw, side, opening)
-        if opening:
-            build_side_street(builder, draw, side)
+        opens = crosses and only_side in (0.0, side)
+        opening_m = draw.uniform(*_SIDE_STREET_M) if opens else 0.0
+        build_ground(builder, draw, side, opening_m)
+        if opens:
+            build_side_street(builder, draw, side, opening_m)
             build_corner(builder, draw, side)
         else:
             build_plots(builder, draw, side, district)
             build_kerbside(builder, draw, side, district)
-    if crosses:
+        if course.kerb(side).pavement_m:
+            builder.clear_walkway(side)
+    if crosses and course.median_m:
         build_island(builder, draw)
     assert builder.num_objects < _MAX_OBJECTS_PER_BLOCK, f"block {block} has too many objects"
     return builder
@@ -185,10 +190,10 @@ def _streams(seed: int, drive: int) -> tuple[_Stream, ...]:
     for lane in range(course.lanes[0]):
         is_ego_lane = lane == course.ego_lane
         speed_m_s = None if is_ego_lane else 10 * course.step_m * draw.uniform(0.85, 1.15)
-        lateral = -(lane + 0.5) * course.lane_m
+        lateral = -course.lane_lateral_m(lane)
         streams.append(_Stream(vehicle, lateral, 1, speed_m_s, draw.uniform(*character.car_gap_m)))
     for lane in range(course.lanes[1]):
-        lateral = (lane + 0.5) * course.lane_m
+        lateral = course.lane_lateral_m(lane)
         gap_m = draw.uniform(*character.car_gap_m)
         streams.append(_Stream(vehicle, lateral, -1, draw.uniform(9, 15), gap_m))
     for side in (-1, 1):
@@ -196,13 +201,12 @@ def _streams(seed: int, drive: int) -> tuple[_Stream, ...]:
         if course.lanes[side > 0]:
             speed_m_s, gap_m = draw.uniform(3.5, 6.5), draw.uniform(80, 300)
             streams.append(_Stream(cyclist, side * (kerb.lanes_m - 0.35), -side, speed_m_s, gap_m))
-        if kerb.pavement_m > 1.5:
-            lateral = side * (kerb.edge_m + kerb.pavement_m - 0.5)
-            for direction in (-1, 1):
-                gap_m = draw.uniform(*character.people_gap_m)
-                speed_m_s = draw.uniform(0.9, 1.7)
-                at = lateral - 0.25 * direction
-                streams.append(_Stream(person, at, direction, speed_m_s, gap_m))
+        if kerb.pavement_m:
+            lateral = side * sum(course.walkway_m(side)) / 2
+            # As many people as with one stream for each direction, who would meet.
+            gap_m = draw.uniform(*character.people_gap_m) / 2
+            speed_m_s, direction = draw.uniform(0.9, 1.7), draw.choice((-1, 1))
+            streams.append(_Stream(person, lateral, direction, speed_m_s, gap_m))
     return tuple(streams)
 
 
