@@ -50,7 +50,8 @@ def test_steps_of_1_2_4_and_8_are_learned_equally_often():
     module.draw_path, module.log_dict = lambda *_: draws, lambda *_, **__: None
 
     def average(x, time, target):
-        asked.update(zip(time.tolist(), target.tolist(), strict=True))
+        if len(x) == 32:  # not on the way to where steps start
+            asked.update(zip(time.tolist(), target.tolist(), strict=True))
         return x
 
     module.sit.average_velocity = average
@@ -62,6 +63,35 @@ def test_steps_of_1_2_4_and_8_are_learned_equally_often():
         times = average_times(steps).float().tolist()
         expected.update(dict.fromkeys(pairwise(times), 8 // steps))
     assert asked == expected
+
+
+@pytest.mark.parametrize("steps", [1, 2, 4, 8])
+def test_all_but_the_shortest_steps_start_where_the_steps_before_them_lead(steps):
+    module = stage_module("few_step")
+    points, times = torch.randn(steps, 9, 4, 4, 8), average_times(steps).float()
+    first = torch.arange(0, 8, 8 // steps)
+    starts = module._starts(points, torch.stack([first, first + 8 // steps], dim=1))
+    x = points[:, 0]
+    for number in range(steps):
+        expected = points[number, number] if steps == 8 else x[number]
+        torch.testing.assert_close(starts[number], expected)
+        time, target = times[number].expand(steps), times[number + 1].expand(steps)
+        x = x - (time - target)[0] * module.sit.average_velocity(x, time, target)
+
+
+def test_weights_that_led_to_a_start_still_learn_in_bfloat16():
+    """Autocast would keep them as they were cast without gradients."""
+    module = stage_module("few_step")
+    module.on_fit_start()
+    draws = PathDraws(
+        torch.zeros(2, 4, 4, 8), torch.tensor([0.45, 0.3]), torch.randn(2, 9, 4, 4, 8)
+    )
+    module.draw_latents = lambda _: (torch.zeros(2, 4, 4, 8), draws)
+    module.log_dict = lambda *_, **__: None
+    with torch.autocast("cpu", torch.bfloat16):
+        module.training_step(TinyData().batches[0], 0).backward()
+    for name, weight in module.sit.average.named_parameters():
+        assert weight.grad is not None, name
 
 
 def test_points_of_a_trajectory_lie_at_the_times_of_eight_average_steps():
@@ -200,12 +230,10 @@ def test_trajectories_have_the_precision_of_the_steps(tmp_path):
     assert (found - module.solve([0, 1])).abs().max() > 0.01
 
 
-@pytest.mark.parametrize(
-    ("stage", "blocks"), [("flow_matching", 1), ("few_step", 1), ("few_step", 2)]
-)
-def test_stages_start_from_the_flow_of_few_steps(stage, blocks, tmp_path):
-    """Its copied blocks are left out, trained on, or, if they are more or fewer, made again."""
-    settings = {"spread": 0.3, "sit_args": {"average_blocks": blocks}, "stage": "few_step"}
+@pytest.mark.parametrize("stage", ["flow_matching", "few_step"])
+def test_stages_start_from_the_flow_of_few_steps(stage, tmp_path):
+    """Its copied blocks are left out, or trained on."""
+    settings = {"spread": 0.3, "sit_args": {"average_blocks": 1}, "stage": "few_step"}
     before = read_checkpoint(
         tiny_checkpoint(tmp_path / "few.safetensors", TinyData.geometry, **settings)
     )
@@ -220,8 +248,30 @@ def test_stages_start_from_the_flow_of_few_steps(stage, blocks, tmp_path):
     average = flow.average_velocity(x, time, 0 * time)
     assert not torch.allclose(average, velocity)
     if stage == "few_step":
-        expected = average if blocks == 1 else velocity
-        assert torch.equal(sit.average_velocity(x, time, 0 * time), expected)
+        assert torch.equal(sit.average_velocity(x, time, 0 * time), average)
+
+
+@pytest.mark.parametrize(("before", "now"), [(1, 2), (2, 1)])
+def test_copied_blocks_stay_where_they_were_if_there_are_more_or_fewer(before, now, tmp_path):
+    settings = {"spread": 0.3, "sit_args": {"average_blocks": before}, "stage": "few_step"}
+    checkpoint = read_checkpoint(
+        tiny_checkpoint(tmp_path / "few.safetensors", TinyData.geometry, **settings)
+    )
+    module = stage_module("few_step")
+    module.sit = AverageVelocitySiT(now, **SIT_ARGS)
+    load_into({"sit": module.sit}, module.previous_networks(checkpoint), "few_step")
+    flow = checkpoint.network("ema").build()
+    found = module.sit.average
+    assert_equal_weights(found.embedder, flow.average.embedder)
+    assert_equal_weights(found.final_layer, flow.average.final_layer)
+    assert_equal_weights(found.blocks[-1], flow.average.blocks[-1])
+    if now == 2:
+        assert_equal_weights(found.blocks[0], flow.blocks[0])
+
+
+def assert_equal_weights(network, expected):
+    for key, value in expected.state_dict().items():
+        assert torch.equal(network.state_dict()[key], value), key
 
 
 def test_processes_take_all_trajectories_in_turn():

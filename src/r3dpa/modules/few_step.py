@@ -63,13 +63,17 @@ class FewStep(FlowMatching):
     ones. The thin decoder learns the images that the VAE decodes from the latents of training
     scans.
 
-    Source: trajectory regression as in consistency mid-training (Hu et al. 2025); of guided
-    velocities: Meng et al., "On distillation of guided diffusion models" (CVPR 2023).
+    Only the shortest steps start from points of a trajectory. The others start from where the
+    steps before them lead, and learn to come back to it.
+
+    Source: trajectory regression as in consistency mid-training (Hu et al. 2025); starts that the
+    learner itself reaches: Ross et al., DAgger (AISTATS 2011); guided velocities: Meng et al., "On
+    distillation of guided diffusion models" (CVPR 2023).
 
     Args:
         vae: Range-image autoencoder; fixed.
-        sit: SiT with a copy of its last blocks. Training starts from the copy in ``init_from``, if
-            it has one of as many blocks.
+        sit: SiT with a copy of its last blocks. Training starts from the copied blocks in
+            ``init_from``, and from the flow's own where they are fewer or missing.
         thin_decoder: Decoder to distil; None trains none.
         trajectories: Number of trajectories, 16 velocities each in the precision of the steps.
         **kwargs: See :class:`FlowMatching`. ``init_from`` is a checkpoint of stage flow_matching,
@@ -129,9 +133,8 @@ class FewStep(FlowMatching):
         before = super().previous_networks(before)
         flow = before.network("ema")
         networks = dict(before.networks) | {"latent_norm": before.network("ema_latent_norm")}
-        weights = cast(AverageVelocitySiT, self.sit).with_average(flow.state_dict)
-        if trained.keys() == _average_weights(weights).keys():
-            weights |= trained
+        sit = cast(AverageVelocitySiT, self.sit)
+        weights = sit.with_average(flow.state_dict, trained)
         networks["sit"] = replace(flow, state_dict=weights)
         return replace(before, networks=networks)
 
@@ -222,13 +225,33 @@ class FewStep(FlowMatching):
         pair = _PAIRS.to(points.device)[(draws.time * len(_PAIRS)).long()]
         time, target = average_times(_POINTS).to(draws.time)[pair].unbind(dim=1)
         each = torch.arange(len(pair), device=points.device)
-        x, end = points[each, pair[:, 0]], points[each, pair[:, 1]]
+        x, end = self._starts(points, pair), points[each, pair[:, 1]]
         average = (x - end) / per_sample(time - target, x)
 
         predicted = cast(AverageVelocitySiT, self.sit).average_velocity(x, time, target)
         error = losses.flow_matching_loss(predicted, average)
         parts = {"denoising": self.weights.denoising * error.mean()}
         return self.weigh_and_log(parts | self._decoder_losses(latents))
+
+    @torch.no_grad()
+    def _starts(self, points: Tensor, pair: Tensor) -> Tensor:
+        """Latents ``(B, C, h, w)`` that a step from ``pair[:, 0]`` to ``pair[:, 1]`` starts from.
+
+        Where the steps before it, of the same length, lead, so that it learns to mend their
+        errors; shortest steps, of which there would be many before it, start from the trajectory.
+        """
+        sit, times = cast(AverageVelocitySiT, self.sit), average_times(_POINTS).to(points)
+        first, length = pair[:, 0], pair[:, 1] - pair[:, 0]
+        at = torch.where(length > 1, 0, first)
+        x = points[torch.arange(len(points), device=points.device), at]
+        while (behind := at < first).any():
+            time, target = times[at[behind]], times[(at + length)[behind]]
+            slope = sit.average_velocity(x[behind], time, target)
+            x[behind] += per_sample(target - time, slope) * slope.to(x)
+            at = torch.where(behind, at + length, at)
+        # In torch before 2.11, autocast would keep the weights that it cast here, without gradient.
+        torch.clear_autocast_cache()
+        return x
 
     def held_out_errors(
         self, reconstruction: Tensor, latents: Tensor, draws: PathDraws
