@@ -70,32 +70,32 @@ class Character(NamedTuple):
 
 _TOWN = Character(
     lanes=((1, 1), (1, 1), (1, 0)), districts=(0.6, 0.15, 0.0, 0.1, 0.1, 0.05, 0.0),
-    parked=(0.17, 0.45), parking=0.8, pavement=1.0, clutter=0.8, people=0.35, lights=True,
+    parked=(0.17, 0.45), parking=0.8, pavement=1.0, clutter=1.1, people=0.52, lights=True,
     island=0.3, car_gap_m=(40, 90), people_gap_m=(40, 90), crossing_every=(3, 6), slope=0.01,
 )  # fmt: skip
 _ROW_HOUSES = Character(
     lanes=((1, 1), (1, 0)), districts=(0.1, 0.55, 0.2, 0.1, 0.05, 0.0, 0.0),
-    parked=(0.21, 0.57), parking=0.8, pavement=0.95, clutter=1.7, people=0.15, lights=False,
+    parked=(0.21, 0.57), parking=0.8, pavement=0.95, clutter=2.4, people=0.22, lights=False,
     island=0.1, car_gap_m=(60, 140), people_gap_m=(50, 140), crossing_every=(4, 8), slope=0.02,
 )  # fmt: skip
 _SUBURB = Character(
     lanes=((1, 1), (1, 0)), districts=(0.05, 0.15, 0.65, 0.05, 0.1, 0.0, 0.0),
-    parked=(0.18, 0.54), parking=0.75, pavement=0.95, clutter=1.6, people=0.15, lights=False,
+    parked=(0.18, 0.54), parking=0.75, pavement=0.95, clutter=2.2, people=0.22, lights=False,
     island=0.1, car_gap_m=(60, 140), people_gap_m=(60, 160), crossing_every=(4, 8), slope=0.025,
 )  # fmt: skip
 _GREEN = Character(
     lanes=((1, 1),), districts=(0.05, 0.05, 0.15, 0.1, 0.55, 0.1, 0.0),
-    parked=(0.17, 0.48), parking=0.4, pavement=0.6, clutter=0.3, people=0.05, lights=False,
+    parked=(0.17, 0.48), parking=0.4, pavement=0.6, clutter=0.4, people=0.08, lights=False,
     island=0.2, car_gap_m=(60, 140), people_gap_m=(80, 200), crossing_every=(6, 10), slope=0.025,
 )  # fmt: skip
 _ARTERIAL = Character(
     lanes=((2, 2), (2, 1), (2, 2)), districts=(0.1, 0.05, 0.15, 0.2, 0.4, 0.1, 0.0),
-    parked=(0.21, 0.52), parking=0.5, pavement=0.8, clutter=2.2, people=0.1, lights=True,
+    parked=(0.21, 0.52), parking=0.5, pavement=0.8, clutter=3.1, people=0.15, lights=True,
     island=0.5, car_gap_m=(40, 70), people_gap_m=(60, 160), crossing_every=(5, 9), slope=0.015,
 )  # fmt: skip
 _COUNTRY = Character(
     lanes=((1, 1),), districts=(0.0, 0.0, 0.2, 0.0, 0.3, 0.05, 0.45),
-    parked=(0.12, 0.5), parking=0.2, pavement=0.3, clutter=0.4, people=0.03, lights=False,
+    parked=(0.12, 0.5), parking=0.2, pavement=0.3, clutter=0.6, people=0.04, lights=False,
     island=0.2, car_gap_m=(60, 160), people_gap_m=(120, 300), crossing_every=(8, 12), slope=0.025,
 )  # fmt: skip
 
