@@ -87,7 +87,7 @@ test-lowest: ## default tests with the lowest versions that pyproject.toml allow
 	OMP_NUM_THREADS=1 $(LOWEST)/bin/pytest -n 2 --dist worksteal -p no:nbmake -m $(DEFAULT_TESTS)
 
 test-all: $(READY) ## every test that this machine can run
-	$(BIN)/pytest
+	OMP_NUM_THREADS=1 $(BIN)/pytest
 
 test-numerics: $(READY) ## hard numerical cases
 	$(BIN)/pytest -m numerics
