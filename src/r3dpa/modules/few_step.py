@@ -72,8 +72,8 @@ class FewStep(FlowMatching):
 
     Args:
         vae: Range-image autoencoder; fixed.
-        sit: SiT with a copy of its last blocks. Training starts from the copied blocks in
-            ``init_from``, and from the flow's own where they are fewer or missing.
+        sit: SiT with a copy of its last blocks. Training starts from the copy in ``init_from``, if
+            it has one of as many blocks.
         thin_decoder: Decoder to distil; None trains none.
         trajectories: Number of trajectories, 16 velocities each in the precision of the steps.
         **kwargs: See :class:`FlowMatching`. ``init_from`` is a checkpoint of stage flow_matching,
@@ -133,8 +133,9 @@ class FewStep(FlowMatching):
         before = super().previous_networks(before)
         flow = before.network("ema")
         networks = dict(before.networks) | {"latent_norm": before.network("ema_latent_norm")}
-        sit = cast(AverageVelocitySiT, self.sit)
-        weights = sit.with_average(flow.state_dict, trained)
+        weights = cast(AverageVelocitySiT, self.sit).with_average(flow.state_dict)
+        if trained.keys() == _average_weights(weights).keys():
+            weights |= trained
         networks["sit"] = replace(flow, state_dict=weights)
         return replace(before, networks=networks)
 

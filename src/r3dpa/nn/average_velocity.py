@@ -74,28 +74,19 @@ class AverageVelocitySiT(SiT):
         tokens = self.run_blocks(blocks, self.embed(latents), modulations)
         return self.output(self.average.final_layer, tokens, modulations)
 
-    def with_average(
-        self, weights: Mapping[str, Tensor], trained: Mapping[str, Tensor] | None = None
-    ) -> dict[str, Tensor]:
-        """Weights of a :class:`SiT` with the copies that this network adds.
-
-        Args:
-            weights: Of the SiT.
-            trained: ``average.*`` of another network, perhaps with fewer or more copied blocks:
-                they take the place of the blocks that they were trained for.
-        """
+    def with_average(self, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Weights of a :class:`SiT` with the copies that this network adds."""
         state = self.state_dict()
         first = len(self.blocks) - len(self.average.blocks)
         added = {key: state[key] for key in state if key.startswith("average.embedder.")}
         for key, value in weights.items():
-            if key.startswith("final_layer."):
+            kind, _, rest = key.partition(".")
+            index, _, name = rest.partition(".")
+            if kind == "final_layer":
                 added[f"average.{key}"] = value
-        added |= _last_blocks(weights, "blocks", -first)
-        trained = trained or {}
-        blocks = {key for key in trained if key.startswith("average.blocks.")}
-        added |= {key: value for key, value in trained.items() if key not in blocks}
-        moved = len(self.average.blocks) - len({key.split(".")[2] for key in blocks})
-        return {**weights, **added, **_last_blocks(trained, "average.blocks", moved)}
+            elif kind == "blocks" and int(index) >= first:
+                added[f"average.blocks.{int(index) - first}.{name}"] = value
+        return {**weights, **added}
 
     @property
     def compiled_parts(self) -> list[nn.Module]:
@@ -112,17 +103,3 @@ class _AverageHead(nn.Module):
         zeroed(self.embedder.mlp[2])
         self.blocks = blocks
         self.final_layer = final_layer
-
-
-def _last_blocks(weights: Mapping[str, Tensor], name: str, moved: int) -> dict[str, Tensor]:
-    """Weights of the blocks ``name.0``, ``name.1``, ... as copies, their numbers moved by so much.
-
-    Blocks that this takes below 0 are left out.
-    """
-    copies = {}
-    for key, value in weights.items():
-        if key.startswith(f"{name}."):
-            number, rest = key.removeprefix(f"{name}.").split(".", 1)
-            if int(number) + moved >= 0:
-                copies[f"average.blocks.{int(number) + moved}.{rest}"] = value
-    return copies
