@@ -21,7 +21,7 @@ def real(path):
 
 
 def scans_of(name, num, **changes):
-    simulator = Simulator(2, sensor=load_sensor(name, **changes))
+    simulator = Simulator(3, sensor=load_sensor(name, **changes))
     return [simulator.scan(7 * number).points for number in range(num)]
 
 

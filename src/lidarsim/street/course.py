@@ -274,7 +274,8 @@ def course_of(seed: int, drive: int) -> Course:
     character = CHARACTERS[(drive + seed) % len(CHARACTERS)]
     lane_m = draw.uniform(*_LANE_M)
     lanes = character.lanes[int(draw.integers(len(character.lanes)))]
-    has_islands = lanes[1] > 0 and draw.random() < character.island
+    # From a generator of its own: roads have the course that they had in simulator version 4.
+    has_islands = lanes[1] > 0 and generator_for(seed, "islands", drive).random() < character.island
     median_m = _MEDIAN_M if has_islands else 0.0
     kerbs = []
     for count in lanes:

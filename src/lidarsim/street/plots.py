@@ -211,7 +211,8 @@ def _yard(builder: Builder, draw: Generator, start: float, side: float, edge_m: 
     else:
         building_site(builder, draw, Strip(side, start, end, edge_m + 0.5, edge_m + 9.0))
     if draw.random() < 0.75:
-        hall(builder, draw, Front(side, start, end, edge_m + draw.uniform(10, 18)))
+        # Its ramp keeps clear of the cars in front of it.
+        hall(builder, draw, Front(side, start, end, edge_m + draw.uniform(11, 18)))
     else:
         _behind(builder, draw, start, side * (edge_m + 22), 0.85)
 
