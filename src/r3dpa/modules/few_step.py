@@ -63,8 +63,8 @@ class FewStep(FlowMatching):
     ones. The thin decoder learns the images that the VAE decodes from the latents of training
     scans.
 
-    Only the shortest steps start from points of a trajectory. The others start from where the
-    steps before them lead, and learn to come back to it.
+    Only the shortest steps, and the first one, start from points of a trajectory. The others start
+    from where a step before them leads, and learn to come back to it.
 
     Source: trajectory regression as in consistency mid-training (Hu et al. 2025); starts that the
     learner itself reaches: Ross et al., DAgger (AISTATS 2011); guided velocities: Meng et al., "On
@@ -238,21 +238,17 @@ class FewStep(FlowMatching):
     def _starts(self, points: Tensor, pair: Tensor) -> Tensor:
         """Latents ``(B, C, h, w)`` that a step from ``pair[:, 0]`` to ``pair[:, 1]`` starts from.
 
-        Where the steps before it, of the same length, lead, so that it learns to mend their
-        errors; shortest steps, of which there would be many before it, start from the trajectory.
+        Where a step as long before it leads, so that it learns to mend its errors. The first step
+        and the shortest ones start from the trajectory, by a step of length 0.
         """
-        sit, times = cast(AverageVelocitySiT, self.sit), average_times(_POINTS).to(points)
         first, length = pair[:, 0], pair[:, 1] - pair[:, 0]
-        at = torch.where(length > 1, 0, first)
-        x = points[torch.arange(len(points), device=points.device), at]
-        while (behind := at < first).any():
-            time, target = times[at[behind]], times[(at + length)[behind]]
-            slope = sit.average_velocity(x[behind], time, target)
-            x[behind] += per_sample(target - time, slope) * slope.to(x)
-            at = torch.where(behind, at + length, at)
+        before = torch.where(length > 1, (first - length).clamp(min=0), first)
+        x = points[torch.arange(len(points), device=points.device), before]
+        time, target = average_times(_POINTS).to(points)[torch.stack([before, first])]
+        slope = cast(AverageVelocitySiT, self.sit).average_velocity(x, time, target)
         # In torch before 2.11, autocast would keep the weights that it cast here, without gradient.
         torch.clear_autocast_cache()
-        return x
+        return x + per_sample(target - time, x) * slope.to(x)
 
     def held_out_errors(
         self, reconstruction: Tensor, latents: Tensor, draws: PathDraws
