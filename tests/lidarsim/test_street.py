@@ -173,13 +173,16 @@ def test_no_car_stands_in_a_building_or_a_garage():
 
 
 def test_nobody_walks_through_things():
+    walkers = 0
     for key, scene in list(many_scenes().items())[::3]:
         solids = (*scene.primitives, *scene.unseen)
         moving = [p for p in solids if p.semantic == Semantic.PERSON and any(p.velocity_m_s)]
         trunks = [p.centre for p in moving]
-        for p in solids:
+        walkers += len(moving)
+        for p in solids if moving else ():
             if not (any(p.velocity_m_s) or p.extinction_per_m or p.semantic in GROUND):
-                assert not trunks or not inside(p, trunks).any(), (key, p)
+                assert not inside(p, trunks).any(), (key, p)
+    assert walkers > 200
 
 
 def test_no_lane_leads_through_a_traffic_island():

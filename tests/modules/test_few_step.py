@@ -84,7 +84,7 @@ def test_all_but_the_shortest_steps_start_where_a_step_before_them_leads(steps):
 
 
 def test_weights_that_led_to_a_start_still_learn_in_bfloat16():
-    """Autocast would keep them as they were cast without gradients."""
+    """Autocast of older releases of torch keeps them as they were cast, without gradients."""
     module = stage_module("few_step")
     module.on_fit_start()
     draws = PathDraws(

@@ -274,7 +274,7 @@ def course_of(seed: int, drive: int) -> Course:
     character = CHARACTERS[(drive + seed) % len(CHARACTERS)]
     lane_m = draw.uniform(*_LANE_M)
     lanes = character.lanes[int(draw.integers(len(character.lanes)))]
-    # From a generator of its own: roads have the course that they had in simulator version 4.
+    # From a generator of its own, so that the chance of islands changes no other course.
     has_islands = lanes[1] > 0 and generator_for(seed, "islands", drive).random() < character.island
     median_m = _MEDIAN_M if has_islands else 0.0
     kerbs = []

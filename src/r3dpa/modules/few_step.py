@@ -63,7 +63,7 @@ class FewStep(FlowMatching):
     ones. The thin decoder learns the images that the VAE decodes from the latents of training
     scans.
 
-    Only the shortest steps, and the first one, start from points of a trajectory. The others start
+    Steps from the noise, and the shortest ones, start from points of a trajectory. The others start
     from where a step before them leads, and learn to come back to it.
 
     Source: trajectory regression as in consistency mid-training (Hu et al. 2025); starts that the
@@ -238,15 +238,15 @@ class FewStep(FlowMatching):
     def _starts(self, points: Tensor, pair: Tensor) -> Tensor:
         """Latents ``(B, C, h, w)`` that a step from ``pair[:, 0]`` to ``pair[:, 1]`` starts from.
 
-        Where a step as long before it leads, so that it learns to mend its errors. The first step
-        and the shortest ones start from the trajectory, by a step of length 0.
+        Where a step as long before it leads, so that it learns to mend its errors. Steps from the
+        noise and the shortest ones start from the trajectory, after a step of length 0.
         """
         first, length = pair[:, 0], pair[:, 1] - pair[:, 0]
         before = torch.where(length > 1, (first - length).clamp(min=0), first)
         x = points[torch.arange(len(points), device=points.device), before]
         time, target = average_times(_POINTS).to(points)[torch.stack([before, first])]
         slope = cast(AverageVelocitySiT, self.sit).average_velocity(x, time, target)
-        # In torch before 2.11, autocast would keep the weights that it cast here, without gradient.
+        # Older releases of torch keep the weights that autocast has cast here, without gradient.
         torch.clear_autocast_cache()
         return x + per_sample(target - time, x) * slope.to(x)
 
