@@ -161,7 +161,10 @@ def test_decoders_are_averaged_by_their_share(tmp_path):
 def test_a_flow_that_was_trained_on_takes_the_place_of_the_first(tmp_path, stage):
     few = tiny_checkpoint(tmp_path / "few.safetensors", stage="few_step")
     out = tmp_path / "out.safetensors"
-    content = read_checkpoint(tiny_checkpoint(tmp_path / "first.safetensors", stage=stage))
+    guidance = {"perturbed_attention": {"block": 1, "scale": 2.0}}
+    content = read_checkpoint(
+        tiny_checkpoint(tmp_path / "first.safetensors", stage=stage, sampling=guidance)
+    )
 
     def trained_on(*names):
         networks = dict(content.networks)
@@ -174,6 +177,7 @@ def test_a_flow_that_was_trained_on_takes_the_place_of_the_first(tmp_path, stage
 
     moved = trained_on("ema", "ema_latent_norm")
     convert(few, out, flow=moved)
+    assert read_checkpoint(out).sampling == content.sampling != {}
     before, after, others = load_file(few), load_file(out), load_file(moved)
     assert read_checkpoint(out).networks["ema"].class_path.endswith("AverageVelocitySiT")
     taken = {key for key in before if not torch.equal(before[key], after[key])}
@@ -181,8 +185,14 @@ def test_a_flow_that_was_trained_on_takes_the_place_of_the_first(tmp_path, stage
     assert not any(key.startswith("ema.average.") for key in taken)  # few steps stay
     assert all(torch.equal(after[key], others[key]) for key in taken)
     wide = tiny_checkpoint(tmp_path / "wide.safetensors", sit_args={"mlp_ratio": 2.0})
+    heads = tiny_checkpoint(tmp_path / "heads.safetensors", sit_args={"num_heads": 1})
+    cosine = save_checkpoint(
+        replace(content, interpolant="cosine"), tmp_path / "cosine.safetensors"
+    )
     for other, message in (
         (wide, r"blocks\.0\.mlp\.fc1\.bias has shape"),
+        (heads, r"ema has num_heads 1 there and 2 here"),
+        (cosine, r"was trained on the cosine path, .* on the linear path"),
         (trained_on("vae"), "has another encoder than"),
     ):
         with pytest.raises(ValueError, match=message):

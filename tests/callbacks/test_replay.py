@@ -72,6 +72,21 @@ def test_the_perceptual_loss_has_the_geometry_of_the_weights(tmp_path):
     assert "perceptual" in losses.splitlines()[0]
 
 
+def test_the_decoder_gets_the_noise_of_the_step(tmp_path):
+    weights = LossWeights(vae_alignment=0.0)
+    options = {"weights": weights, "latent_noise": 1.0}
+    module = guarded("vae_alignment", [0], constant_loss, **options)
+    train(module, NamedData(1), default_root_dir=tmp_path)
+    (file,) = (tmp_path / "bad_batches").iterdir()
+    text = replay(file, save(stage_module("vae_alignment"), tmp_path / "before.safetensors"))
+    module = train(stage_module("vae_alignment", **options), NamedData(1))
+    total = float(torch.stack(list(module.parts[0].values())).sum())
+    assert f"loss {total:.3g}" in text.split("losses now:")[1]
+    without = stage_module("vae_alignment", weights=weights)
+    train(without, NamedData(1))
+    assert float(torch.stack(list(without.parts[0].values())).sum()) != pytest.approx(total)
+
+
 def test_a_stage_of_another_package_is_named(file, tmp_path):
     saved = torch.load(file, weights_only=True) | {"stage": "mine"}
     torch.save(saved, tmp_path / "mine.pt")

@@ -39,6 +39,14 @@ def test_the_same_size_keeps_everything(shipped):
     assert all(torch.equal(v, weights[k]) for k, v in networks["vae"].state_dict().items())
 
 
+def test_a_stage_may_have_made_its_flow_of_the_averages(shipped):
+    before = _without_average(shipped)
+    networks = dict(before.networks)
+    made = replace(before, networks=networks | {"sit": networks.pop("ema")})
+    before, rows = resize_to(networks_for(shipped, (4, 8), (8, 64)), made, shipped)
+    assert results(rows) == {"sit: average": "dropped"}
+
+
 def test_a_stem_of_fewer_rows_makes_the_same_latents_of_a_coarser_image(shipped):
     networks = networks_for(shipped, (2, 8), (8, 64))
     before, rows = resize_to(networks, _without_average(shipped), shipped)

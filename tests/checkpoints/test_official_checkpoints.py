@@ -82,6 +82,26 @@ class TestOfficial:
         with pytest.raises(ValueError, match="legacy_upsample=True"):
             to_official(replace(checkpoint, networks=networks))
 
+    @pytest.mark.parametrize(
+        ("changes", "message"),
+        [
+            ({"in_channels": 2}, "has in_channels 2: only one with in_channels 1"),
+            ({"in_channels": 2, "modes": 2}, "has in_channels 2"),
+            ({"stem": (2, 2)}, r"has stem \(2, 2\): only one with stem \(1, 1\)"),
+        ],
+    )
+    def test_a_vae_that_the_official_code_cannot_run_is_refused(self, checkpoint, changes, message):
+        args = VAE_ARGS | changes
+        networks = {"vae": NetworkState.of(VAE(**args), args)}
+        with pytest.raises(ValueError, match=message):
+            to_official(replace(checkpoint, networks=networks))
+
+    def test_a_convolutional_projector_has_no_counterpart(self, checkpoint):
+        args = SIT_ARGS | {"projector": "conv"}
+        networks = dict(checkpoint.networks) | {"sit": NetworkState.of(SiT(**args), args)}
+        with pytest.raises(ValueError, match=r"sit of .* has a convolutional projector"):
+            to_official(replace(checkpoint, networks=networks))
+
     def test_an_export_of_averaged_weights_has_a_counterpart(self, checkpoint):
         names = ("vae", "ema", "ema_latent_norm")
         exported = replace(checkpoint, networks={name: checkpoint.network(name) for name in names})

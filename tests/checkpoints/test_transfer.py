@@ -105,6 +105,14 @@ class TestTransfer:
             transfer_rgb(self.source(**changes), sit, LatentNorm(4), keep_projector=True)
         torch.testing.assert_close(sit.state_dict(), before, **EXACT)
 
+    def test_another_width_of_attention_heads_fits_but_computes_something_else(self):
+        args = {"in_channels": 4, "input_size": (4, 8), "channels": 32, "feature_dim": 8}
+        state = NetworkState.of(UNet(**args, head_channels=16), args | {"head_channels": 16})
+        with pytest.raises(ValueError, match="head_channels: checkpoint 16, network 32"):
+            load_into(
+                {"sit": UNet(**args)}, Checkpoint(Path("unet"), "joint", {"sit": state}), "joint"
+            )
+
     def test_weights_of_range_images_are_none_of_rgb(self):
         source = replace(self.source(), stage="joint", geometry=GEOMETRY.to_dict())
         sit = randomised(SiT(**SIT_ARGS))

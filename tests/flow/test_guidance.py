@@ -201,6 +201,26 @@ def test_outside_of_the_interval_no_gradient_is_computed():
     assert torch.equal(term[1], whole[1])
 
 
+@pytest.mark.parametrize("legacy", [False, True])
+def test_the_sde_is_guided_inside_of_the_interval_only(legacy):
+    guidance = build(interval=(0.4, 0.6), legacy=legacy)
+    noises = iter(lambda: torch.zeros_like(latents()), None)
+    euler_maruyama(
+        guidance.sde_velocity,
+        latents(),
+        sde_times(10),
+        noises,
+        change_drift=guidance.change_drift,
+    )
+    inside = (sde_times(10)[:-1] >= 0.4) & (sde_times(10)[:-1] <= 0.6)
+    assert len(guidance.history) == inside.sum() > 0
+    if legacy:
+        drift, mixed = torch.zeros_like(latents()), torch.tensor([0.1, 0.5, 0.9])
+        term = guidance.change_drift(drift, latents(), mixed)
+        assert term[[0, 2]].abs().max() == 0
+        assert term[1].abs().max() > 0
+
+
 def test_cells_of_the_target_without_points_are_not_selected():
     goal, mask, x, time = target(), masks(), latents(), times()
     goal[:, 0] = 0

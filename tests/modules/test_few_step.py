@@ -150,11 +150,13 @@ def test_pairs_of_points_are_drawn_evenly_whatever_the_flow_was_trained_with():
     assert stage_module("few_step", time_sampling="lognormal").time_sampling == "uniform"
 
 
-def test_a_flow_of_another_path_is_refused(tmp_path):
+@pytest.mark.parametrize("stage", ["few_step", "flow_matching"])
+def test_a_flow_of_another_path_is_refused(tmp_path, stage):
     before = read_checkpoint(
         tiny_checkpoint(tmp_path / "few.safetensors", TinyData.geometry, stage="few_step")
     )
-    module = stage_module("few_step", path="cosine")
+    networks = ["vae", "latent_norm", "sit"]
+    module = stage_module(stage, path="cosine", init_networks=networks)
     with pytest.raises(ValueError, match=r"was trained on the linear path.*model.init_args.path"):
         module.previous_networks(before)
 

@@ -311,6 +311,12 @@ def test_centred_features_have_no_mean_and_keep_empty_cells():
     assert centred_features(grid).tolist() == [[[-1.0, -2.0], [1.0, 2.0], [0.0, 0.0]]]
 
 
+def test_a_balanced_adversarial_loss_is_logged_without_a_weight():
+    weights = LossWeights(adversarial_ratio=0.5)
+    module = train(stage_module("joint", weights=weights), TinyData([False]))
+    assert module.logged_losses["adversarial"] == module.parts[0]["adversarial"]
+
+
 def test_alignment_of_the_sit_stops():
     weights = LossWeights(alignment_stop=2)
     module = train(stage_module("joint", weights=weights), TinyData([False] * 3))

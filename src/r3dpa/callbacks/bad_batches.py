@@ -35,6 +35,7 @@ def save_bad_batch(
         "path": module.interpolant.path,
         "losses": losses,
         "weights": weights,
+        "latent_noise": module.latent_noise,
         "batch": {key: value.cpu() for key, value in tensors.items()},
         "draws": {key: value.cpu() for key, value in draws._asdict().items()},
     }

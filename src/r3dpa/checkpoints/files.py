@@ -287,10 +287,19 @@ def _mean_of(
 
 
 def _with_flow_of(checkpoint: Checkpoint, other: Checkpoint) -> Checkpoint:
-    """Checkpoint with the flow of ``other`` and its latent statistics; its few steps stay."""
+    """Checkpoint with the flow of ``other``, its latent statistics and its guidance.
+
+    Its few steps stay.
+    """
     _check_same_latents(checkpoint, other)
+    if other.interpolant != checkpoint.interpolant:
+        raise ValueError(
+            f"{other.path} was trained on the {other.interpolant} path, {checkpoint.path} on the "
+            f"{checkpoint.interpolant} path: give a flow of the same path"
+        )
     networks = dict(checkpoint.networks)
     for name in _FLOW & networks.keys():
+        _check_same_arguments(name, checkpoint, other)
         weights, given = networks[name].state_dict, other.network(name).state_dict
         flow = {key: value for key, value in given.items() if not key.startswith(_FEW_STEPS)}
         needed = {key for key in weights if not key.startswith(_FEW_STEPS)}
@@ -302,7 +311,18 @@ def _with_flow_of(checkpoint: Checkpoint, other: Checkpoint) -> Checkpoint:
                     f"shape {there} there and {here} here"
                 )
         networks[name] = replace(networks[name], state_dict={**weights, **flow})
-    return replace(checkpoint, networks=networks)
+    return replace(checkpoint, networks=networks, sampling=other.sampling)
+
+
+def _check_same_arguments(name: str, checkpoint: Checkpoint, other: Checkpoint) -> None:
+    """Refuse a network that computes something else with weights of the same shapes."""
+    here, there = checkpoint.network(name).arguments, other.network(name).arguments
+    for key in ("input_size", "num_heads", "alignment_depth"):
+        if key in here and here[key] != there.get(key):
+            raise ValueError(
+                f"the flow of {other.path} does not fit {checkpoint.path}: {name} has {key} "
+                f"{there.get(key)} there and {here[key]} here"
+            )
 
 
 def _check_same_latents(checkpoint: Checkpoint, other: Checkpoint) -> None:

@@ -60,7 +60,9 @@ def resize_to(
             layers = ", ".join(dict.fromkeys(key.rpartition(".")[0] or key for key in resized))
             reason = "other number of tokens" if _POSITIONS in resized else "other stem"
             rows.append(TransferRow(f"{name}: {layers}", len(resized), "resized", reason))
-        left_out = given.network(source).state_dict.keys() - state.state_dict.keys()
+        # A stage may have made `sit` of the average in the file.
+        origin = source if source in given.networks else AVERAGES.get(source, source)
+        left_out = given.network(origin).state_dict.keys() - state.state_dict.keys()
         if left_out:
             group = f"{name}: {min(left_out).partition('.')[0]}"
             rows.append(TransferRow(group, len(left_out), "dropped", "not of this stage"))

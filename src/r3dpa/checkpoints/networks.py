@@ -40,6 +40,7 @@ AVERAGES = {"sit": "ema", "latent_norm": "ema_latent_norm"}
 _SHAPELESS_ARGS = {
     "input_size": "input_size",
     "num_heads": "num_heads",
+    "head_channels": "head_channels",
     "alignment_depth": "alignment_depth",
     "eps": "eps",
     "legacy_upsample": "legacy",

@@ -149,6 +149,11 @@ def to_official(checkpoint: Checkpoint) -> dict[str, Any]:
     for key, (sit_name, norm_name) in _SIT_NETWORKS.items():
         if sit_name in checkpoint.networks:
             sit = _official_part(checkpoint, sit_name, SiT, UNet)
+            if sit.arguments.get("projector", "mlp") != "mlp":
+                raise ValueError(
+                    f"{sit_name} of {checkpoint.path} has a convolutional projector: only one "
+                    "built with projector: mlp has an official counterpart"
+                )
             norm = checkpoint.networks.get(norm_name) or checkpoint.network("latent_norm")
             weights = {
                 re.sub(r"^projector\.", "projectors.0.", k): v for k, v in sit.state_dict.items()
@@ -157,15 +162,29 @@ def to_official(checkpoint: Checkpoint) -> dict[str, Any]:
     for key, kind in (("vae", VAE), ("discriminator", PatchDiscriminator)):
         if key in checkpoint.networks:
             content[key] = dict(_official_part(checkpoint, key, kind).state_dict)
-    if "vae" in content and not checkpoint.network("vae").arguments["legacy_upsample"]:
-        raise ValueError(
-            f"the VAE of {checkpoint.path} wraps columns when it upsamples: only one built with "
-            "legacy_upsample=True has an official counterpart"
-        )
+    if "vae" in content:
+        _check_official_vae(checkpoint)
     if checkpoint.step is not None:
         content["steps"] = checkpoint.step
     args = dict(checkpoint.official_args) or _args_of(checkpoint)
     return content | {"args": argparse.Namespace(**args)}
+
+
+def _check_official_vae(checkpoint: Checkpoint) -> None:
+    """Refuse a VAE that the official code could not run."""
+    arguments = checkpoint.network("vae").arguments
+    if not arguments["legacy_upsample"]:
+        raise ValueError(
+            f"the VAE of {checkpoint.path} wraps columns when it upsamples: only one built with "
+            "legacy_upsample=True has an official counterpart"
+        )
+    for name, official in (("in_channels", 1), ("modes", 1), ("stem", (1, 1))):
+        value = arguments[name]
+        if (tuple(value) if isinstance(official, tuple) else value) != official:
+            raise ValueError(
+                f"the VAE of {checkpoint.path} has {name} {value}: only one with {name} {official} "
+                "has an official counterpart"
+            )
 
 
 def statistics_of(norm: StateDict) -> dict[str, Tensor]:

@@ -112,7 +112,12 @@ def replay(file: Path, ckpt: Path, device: str = "cpu") -> str:
     known = {"vae", "sit", "latent_norm", "discriminator", "thin_decoder"} & set(weights.networks)
     networks: Any = {name: weights.network(name).build() for name in known}
     settings = LossWeights(**saved["weights"])
-    module = stages[saved["stage"]](**networks, weights=settings, path=saved["path"]).to(device)
+    module = stages[saved["stage"]](
+        **networks,
+        weights=settings,
+        path=saved["path"],
+        latent_noise=saved.get("latent_noise", 0.0),
+    ).to(device)
     if weights.geometry is not None:
         module.geometry = ScanGeometry.from_dict(dict(weights.geometry))
     draws = saved["draws"]._make(value.to(device) for value in saved["draws"])

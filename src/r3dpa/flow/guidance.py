@@ -179,9 +179,8 @@ class FeatureGuidance:
 
     def __call__(self, x: Tensor, time: Tensor) -> Tensor:
         """Guided velocity ``(B, ...)`` at noisy latents ``(B, ...)`` and flow times ``(B,)``."""
-        first, last = self._interval
-        everywhere = (first, last) == (0, 1)
-        inside = (time >= first) & (time <= last)
+        everywhere = self._interval == (0, 1)
+        inside = self._inside(time)
         if self._idle or not (everywhere or inside.any()):
             return self.velocity(x, time)
         finish, energy, gradient = self._evaluate(x, time)
@@ -221,11 +220,17 @@ class FeatureGuidance:
         """Number of times that a sample went unguided because its gradient was not finite."""
         return int(self._num_dropped)
 
+    def _inside(self, time: Tensor) -> Tensor:
+        """Whether each time ``(B,)`` is guided."""
+        first, last = self._interval
+        return (time >= first) & (time <= last)
+
     def _add_to_drift(self, drift: Tensor, x: Tensor, time: Tensor) -> Tensor:
-        if self._idle:
+        inside = self._inside(time)
+        if self._idle or not inside.any():
             return drift
         _, energy, gradient = self._evaluate(x, time)
-        term = self._scale * gradient
+        term = torch.where(per_sample(inside, x), self._scale * gradient, 0.0)
         self._record(energy, drift, term)
         return drift + per_sample(time, x) * term
 

@@ -14,8 +14,10 @@ TimeSampling = Literal["uniform", "lognormal", "u_shaped"]
 class LossWeights:
     """Weights of the training losses.
 
-    A loss of weight 0 does not train, nor does an adversarial one before its start. ``returns``,
-    ``intensity`` and ``classes`` count only if ``reconstruction`` is not 0.
+    A loss of weight 0 has no gradient, nor has an adversarial one before its start or an alignment
+    after its end. AdamW still counts these steps, as officially, and the weight decay of a network
+    that only they train goes on. ``returns``, ``intensity`` and ``classes`` count only if
+    ``reconstruction`` is not 0.
 
     Args:
         reconstruction: Weight of the reconstruction error: of all pixels, or, where images have a

@@ -263,6 +263,8 @@ class Stage(L.LightningModule, ABC):
         """
         total = torch.stack(list(parts.values())).sum()
         factors = {name: getattr(self.weights, name) for name in parts}
+        if self.weights.adversarial_ratio is not None and "adversarial" in factors:
+            factors["adversarial"] = 1.0  # balanced by its gradient, not weighted
         values = {n: value.detach() / factors[n] for n, value in parts.items() if factors[n] != 0}
         values["loss"] = total.detach()
         self.logged_losses = values

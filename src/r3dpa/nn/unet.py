@@ -88,6 +88,7 @@ class UNet(VelocityNetwork):
         self.input_size = (rows, columns)
         self.in_channels = in_channels
         self.channels = channels
+        self.head_channels = head_channels
         self.grid_size = (rows // reduction, columns // reduction)
         self.feature_dim = feature_dim
         self.num_classes = num_classes
