@@ -236,9 +236,11 @@ def _read_numpy(path: Path, data: bytes, columns: tuple[str, ...]) -> Stored:
     if len(named) < sum(map(len, parts.values())):
         raise ScanError(f"{path}: has a column twice: {', '.join(named)}; keep one of each name")
     is_organised = len(shape) == 2
+    is_one_table = len(arrays) == 1
     if is_organised and "ring" not in named:
         named["ring"] = np.indices(shape, dtype=np.uint16)[0]
-        parts["ring"] = {"ring": named["ring"]}
+        if not is_one_table:
+            parts["ring"] = {"ring": named["ring"]}
     table = table_of({name: column.reshape(-1) for name, column in named.items()}, math.prod(shape))
     if is_organised:  # shots without a return are 0 or NaN
         table = table[_are_returns(table)]
@@ -247,7 +249,8 @@ def _read_numpy(path: Path, data: bytes, columns: tuple[str, ...]) -> Stored:
         stream, packed = io.BytesIO(), dict[str, Any]()
         for name, columns in parts.items():
             array = arrays.get(name)
-            if array is not None and array.dtype.names:
+            has_names = array is not None and array.dtype.names
+            if has_names or (is_organised and is_one_table):  # with its ring
                 packed[name] = table
             elif list(columns) == [name]:
                 packed[name] = table[name]

@@ -6,6 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from lidarsim.cloud_formats import ScanError
 from lidarsim.clouds import WRITERS, PointCloud, find_files, read_cloud, suffix_of
 from lidarsim.clouds_bag import is_bag, read_bag
@@ -105,9 +108,19 @@ def _content(cloud: PointCloud, suffix: str, full_intensity: float | None) -> by
                 f"{cloud.where}: has no column ring, and only {rings.sure:.0%} of its points are "
                 "sure of one: give another --to"
             )
-        # Counted from the lowest, as in nuScenes.
-        cloud = cloud.with_column("ring", rings.num_rings - 1 - rings.ring)
+        cloud = cloud.with_column("ring", rings.ring)
+    if suffix == ".pcd.bin":
+        cloud = cloud.with_column("ring", _from_lowest(cloud))
     return WRITERS[suffix](cloud, full_intensity)
+
+
+def _from_lowest(cloud: PointCloud) -> NDArray[np.integer]:
+    """Rings of a cloud, counted from the lowest beam, as in nuScenes."""
+    assert cloud.ring is not None
+    x, y, z = cloud.points.T.astype(float)
+    inclination_rad = np.arctan2(z, np.hypot(x, y))
+    rises = ((cloud.ring - cloud.ring.mean()) * inclination_rad).sum() >= 0
+    return cloud.ring if rises else cloud.ring.max() - cloud.ring
 
 
 def _stem(path: Path) -> str:

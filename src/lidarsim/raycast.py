@@ -256,7 +256,10 @@ def cast_single(
 def surface_distance(
     solids: Solids, index: NDArray[np.integer], origin: Floats, direction: Floats
 ) -> tuple[Floats, Floats]:
-    """Ranges where rays ``(3, M)`` enter and leave their own solids ``index`` (M,); NaN: a miss."""
+    """Ranges where rays ``(3, M)`` enter and leave their own solids ``index`` (M,); NaN: a miss.
+
+    A ray into a gap beside a slat is a miss.
+    """
     enter = np.full(len(index), np.nan, dtype=np.float32)
     leave = enter.copy()
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -264,7 +267,9 @@ def surface_distance(
             chosen = np.flatnonzero(solids.shape[index] == shape)
             solid = _solid(solids, index[chosen])
             start, towards = (array.take(chosen, axis=1) for array in (origin, direction))
-            enter[chosen], leave[chosen] = _crossing(shape, solid, start, towards)
+            near, leave[chosen] = _crossing(shape, solid, start, towards)
+            meets = _meets_slat(solids, index[chosen], solid, start + near * towards)
+            enter[chosen] = np.where(meets, near, np.float32(np.nan))
     missed = ~(enter <= leave)
     enter[missed] = leave[missed] = np.nan
     return enter, leave

@@ -9,6 +9,7 @@ from importlib.util import find_spec
 
 import numpy as np
 import pytest
+from numpy.lib.recfunctions import unstructured_to_structured
 
 from lidarsim.changed_scans import write_below
 from lidarsim.clouds import PointCloud, find_files, read_cloud, write_cloud
@@ -184,7 +185,14 @@ def test_an_organised_array_is_points_with_their_beam(tmp_path):
     np.savez(tmp_path / "a.npz", intensity=shares, xyz=xyz, pose=np.eye(4))
     np.savez(tmp_path / "b.npz", points=xyz, intensity=shares, ring=shares.astype("u2") % 4)
     seen = xyz.any(axis=2) & np.isfinite(xyz).all(axis=2)
-    for name in ("a.npy", "a.npz", "b.npz"):
+    np.savez(tmp_path / "c.npz", np.concatenate([xyz, shares[..., None]], axis=2))
+    table = unstructured_to_structured(
+        np.concatenate([xyz, shares[..., None]], axis=2),
+        np.dtype([(n, "f4") for n in ("x", "y", "z", "intensity")]),
+    )
+    np.save(tmp_path / "d.npy", table)
+    np.savez(tmp_path / "d.npz", table)
+    for name in ("a.npy", "a.npz", "b.npz", "c.npz", "d.npy", "d.npz"):
         cloud = read_cloud(tmp_path / name)
         np.testing.assert_array_equal(cloud.points, xyz[seen])
         np.testing.assert_array_equal(cloud.intensity, shares[seen])
@@ -194,6 +202,8 @@ def test_an_organised_array_is_points_with_their_beam(tmp_path):
         write_cloud(tmp_path / f"half_{name}", half)
         again = read_cloud(tmp_path / f"half_{name}")
         np.testing.assert_array_equal(again.points, cloud.points[::2])
+        np.testing.assert_array_equal(again.intensity, cloud.intensity[::2])
+        np.testing.assert_array_equal(again.ring, cloud.ring[::2])
     with np.load(tmp_path / "half_a.npz") as arrays:
         assert arrays["pose"].tolist() == np.eye(4).tolist()
 

@@ -51,6 +51,16 @@ def test_a_folder_to_nuscenes_and_back_is_the_same(folder, points, tmp_path, cap
     assert capsys.readouterr().out.startswith("1 scan written to")
 
 
+def test_rings_counted_from_the_highest_are_turned_round(folder, tmp_path):
+    convert(folder, tmp_path / "first", "--to", "pcd.bin")
+    cloud = read_cloud(tmp_path / "first/a/0.pcd.bin")
+    for name, ring in (("down", cloud.ring), ("up", cloud.ring.max() - cloud.ring)):
+        write_cloud(tmp_path / f"{name}.ply", cloud.with_column("ring", ring.astype("u2")))
+        convert(tmp_path / f"{name}.ply", tmp_path / f"{name}.pcd.bin")
+        again = read_cloud(tmp_path / f"{name}.pcd.bin")
+        np.testing.assert_array_equal(again.ring, cloud.ring)
+
+
 def test_named_columns_and_full_scale(points, tmp_path):
     rows = np.column_stack([points[:, :3], points[:, 3] * 4000, np.zeros((len(points), 2))])
     (tmp_path / "six.bin").write_bytes(rows.astype("<f4").tobytes())

@@ -189,6 +189,23 @@ def test_thin_solids_that_all_axes_miss(speed_m_s):
     assert sweep.material[ray] == Material.PAINT
 
 
+def test_a_beam_meets_no_more_of_a_fence_than_its_pickets():
+    """Pickets of 8 in 13 cm before a wall, as one solid with gaps and as single boxes."""
+    wall = box((18, 0, 2), (0.1, 30, 4), material=Material.CONCRETE)
+    fence = box((12, 0, 0), (6, 0.02, 30), yaw_rad=np.pi / 2)
+    pickets = [
+        box((12, left, 0), (0.04, 0.02, 30), yaw_rad=np.pi / 2)
+        for left in np.arange(-5.96, 6, 0.13)
+    ]
+    shares = []
+    for solids in ((replace(fence, slats=(0.13, 8 / 13)),), pickets):
+        sweep = swept(Scene((*solids, wall), Pose(z_m=0.0), ground_m=-1000))
+        azimuth = np.arctan2(sweep.direction[1], sweep.direction[0])
+        ahead = np.abs(azimuth) < np.arctan(5 / 12)
+        shares.append((sweep.first.surface[ahead] < len(solids)).mean())
+    assert 8 / 13 < shares[0] < shares[1] < 0.9
+
+
 def test_tiles_of_ground_do_not_mix():
     """A pavement of tiles that meet at grazing incidence, with a step of 12 cm."""
     paving = {"semantic": Semantic.SIDEWALK, "reflectivity": 0.2, "material": Material.PAVING}

@@ -229,6 +229,8 @@ def assert_windows_cut_nothing(monkeypatch, scene, rays, **motion):
 
 def test_single_rays_see_what_the_turn_sees():
     scene = crowd(7, speed_m_s=10.0)
+    fences = [replace(p, slats=(0.3, 0.5)) for p in scene.primitives[::2]]
+    scene = replace(scene, primitives=(*fences, *scene.primitives[1::2]))
     sensor = hdl64e(shots=90)
     turn = Hits(scene, sensor.rays, actor_time_s=sensor.time_s)
     origin, direction = (level(a, scene.pose).reshape(3, -1) for a in sensor.rays)

@@ -185,6 +185,64 @@ def test_nobody_walks_through_things():
     assert walkers > 200
 
 
+def test_walkers_cross_side_streets_on_the_road():
+    crossing = 0
+    for (drive, scan), scene in many_scenes().items():
+        ground = [p for p in scene.primitives if p.semantic in GROUND]
+        for builder in street_module._actors(course_of(0, drive), scan):
+            foot = min(builder.primitives, key=lambda p: p.centre[2] - p.half_size[2])
+            if foot.semantic != Semantic.PERSON:
+                continue
+            x, y, z = foot.centre
+            tops = [(top_at(p, x, y), p.semantic) for p in ground]
+            below = [
+                top
+                for top, p in zip(tops, ground, strict=True)
+                if inside(p, [(x, y, top[0] - 0.1)])
+            ]
+            if below:  # people walk a little beyond the last block
+                height_m, semantic = max(below)
+                assert abs(z - foot.half_size[2] - height_m) < 0.03, (drive, scan)
+                crossing += semantic == Semantic.ROAD
+    assert crossing > 10
+
+
+def test_nobody_stands_in_things_and_no_bin_in_others():
+    standing_people = bins = 0
+    people, trash = Semantic.PERSON, Semantic.TRASH_BIN
+    for drive in range(7):
+        for block in range(30):
+            builder = street_module._block(0, drive, block)
+            solids = [p for p in (*builder.primitives, *builder.details) if p.instance]
+            solids = [p for p in solids if p.material != Material.FOLIAGE]
+            for p in solids:
+                if p.semantic in (people, trash):
+                    others = [q for q in solids if q.semantic not in {p.semantic, people}]
+                    assert not any(inside(q, [p.centre]).any() for q in others)
+                    standing_people += p.semantic == people
+                    bins += p.semantic == trash
+    assert standing_people > 300
+    assert bins > 100
+
+
+def test_cars_park_in_the_direction_of_the_traffic_on_their_side():
+    sides = {True: 0, False: 0}
+    for drive in range(14):
+        course = course_of(0, drive)
+        for block in range(1, course.crossing_every):
+            section = course.section_of(block)
+            for p in street_module._block(0, drive, block).primitives:
+                turn = math.remainder(p.yaw_rad - section.heading_rad, math.tau)
+                dx, dy = p.centre[0] - section.x_m, p.centre[1] - section.y_m
+                left_m = dy * math.cos(section.heading_rad) - dx * math.sin(section.heading_rad)
+                if p.semantic != Semantic.CAR or abs(left_m) > course.kerb(left_m).edge_m:
+                    continue
+                oncoming = left_m > 0 and course.lanes[1] > 0
+                assert (abs(turn) > 2) == oncoming, (drive, block)
+                sides[course.lanes[1] > 0] += left_m > 0
+    assert min(sides.values()) > 20
+
+
 def test_no_lane_leads_through_a_traffic_island():
     islands = 0
     for drive in range(40):

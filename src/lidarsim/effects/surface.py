@@ -230,7 +230,8 @@ class Glass(Effect):
 
     A thick solid of glass is a hollow shell, such as a cabin: a ray that leaves it passes a second
     pane. A thin pane attached to a closed solid of the same instance is a window: through it the
-    solid is seen from inside. The glint of a pane that faces the sensor to within the beam's
+    solid is seen from inside. Panes in the openings of a wall (slats) have curtains: what stands
+    behind them is met from outside. The glint of a pane that faces the sensor to within the beam's
     divergence is not modelled.
     """
 

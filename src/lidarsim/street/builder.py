@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import numpy as np
 from numpy.random import Generator
 
 from lidarsim.scene import Interval, Material, Primitive, Puddle, Semantic, Shape
@@ -41,7 +42,8 @@ class Builder:
     """Collects the solids of one block, given in street coordinates.
 
     ``details`` are solids that exist in scans from nearby only, ``puddles`` places of standing
-    water on a wet road; instances are numbered from ``first_instance`` on.
+    water on a wet road; instances are numbered from ``first_instance`` on. ``openings_m`` are the
+    widths of side streets in the middle of the block, by side.
     """
 
     def __init__(self, course: Course, section: Section, first_instance: int) -> None:
@@ -51,6 +53,7 @@ class Builder:
         self.details: list[Primitive] = []
         self.puddles: list[Puddle] = []
         self.num_objects = 0
+        self.openings_m = {1.0: 0.0, -1.0: 0.0}
         self._first_instance = first_instance
 
     def new_instance(self) -> int:
@@ -190,10 +193,40 @@ class Builder:
             and solid.centre[2] - half_tall < ground_m + _HEADROOM_M
         )
 
+    def clear_places(self) -> None:
+        """Remove people who stand inside something, and bins inside anything but people or bins."""
+        solids = [p for p in (*self.primitives, *self.details) if p.instance]
+        solids = [p for p in solids if p.material != Material.FOLIAGE]
+        people = [p for p in solids if p.semantic == Semantic.PERSON]
+        bins = [p for p in solids if p.semantic == Semantic.TRASH_BIN]
+        others = [p for p in solids if p.semantic not in (Semantic.PERSON, Semantic.TRASH_BIN)]
+        inside = _inside(people, others + bins) | _inside(bins, others)
+        self.primitives = [p for p in self.primitives if p.instance not in inside]
+        self.details = [p for p in self.details if p.instance not in inside]
+
     def puddle(self, draw: Generator, s: float, lateral: float) -> None:
         """Add a place of standing water on a wet road."""
         x, y, _ = self.section.at(s, lateral)
         self.puddles.append(Puddle(x, y, draw.uniform(0.3, 1.6)))
+
+
+def _inside(things: list[Primitive], others: list[Primitive]) -> set[int]:
+    """Instances of the things, taken for round, that reach into others."""
+    if not (things and others):
+        return set()
+    here, there = (np.array([p.centre for p in solids]).T for solids in (things, others))
+    half_here, half_there = (
+        np.array([p.half_size for p in solids]).T for solids in (things, others)
+    )
+    yaw_rad = np.array([p.yaw_rad for p in others])
+    x, y, z = here[:, :, None] - there[:, None]
+    cosine, sine = np.cos(yaw_rad), np.sin(yaw_rad)
+    along_m = np.abs(cosine * x + sine * y) - half_there[0]
+    across_m = np.abs(cosine * y - sine * x) - half_there[1]
+    radius_m = half_here[:2].mean(axis=0)[:, None]
+    meets = np.hypot(along_m.clip(min=0), across_m.clip(min=0)) < radius_m
+    meets &= np.abs(z) < half_here[2][:, None] + half_there[2]
+    return {thing.instance for thing, met in zip(things, meets.any(axis=1), strict=True) if met}
 
 
 def _turned(slopes: tuple[float, float], yaw_rad: float) -> tuple[float, float]:
@@ -216,6 +249,7 @@ def build_ground(builder: Builder, draw: Generator, side: float, opening_m: floa
     pavement = (side * edge_m, side * (edge_m + pavement_m))
     beyond = (pavement[1], side * (edge_m + _TERRAIN_M))
     strips = (pavement, beyond) if pavement_m else (beyond,)
+    builder.openings_m[side] = opening_m
     if opening_m:
         near, far = (0.0, (BLOCK_M - opening_m) / 2), ((BLOCK_M + opening_m) / 2, BLOCK_M)
         for strip in strips:

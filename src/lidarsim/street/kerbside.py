@@ -60,12 +60,13 @@ def build_kerbside(builder: Builder, draw: Generator, side: float, district: Gen
 
 
 def _parked_row(builder: Builder, draw: Generator, side: float, share: float) -> None:
-    """Cars parked along the kerb."""
+    """Cars parked along the kerb, in the direction of the traffic on their side."""
     start, edge_m = builder.section.block * BLOCK_M, builder.course.kerb(side).edge_m
+    oncoming = side > 0 and builder.course.lanes[1] > 0
     for place in range(int(BLOCK_M / _PARKING_PLACE_M)):
         s = start + _PARKING_PLACE_M * (place + 0.5) + draw.uniform(-0.25, 0.25)
         if draw.random() < share:
-            yaw_rad = draw.normal(0.0, 0.02) + (math.pi if side > 0 else 0.0)
+            yaw_rad = draw.normal(0.0, 0.02) + (math.pi if oncoming else 0.0)
             at = (s, side * (edge_m - PARKING_M / 2 + draw.normal(0, 0.06)))
             builder.body(parked_vehicle(draw), at, yaw_rad, builder.new_instance())
 

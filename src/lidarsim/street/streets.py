@@ -151,6 +151,7 @@ def _block(seed: int, drive: int, block: int) -> Builder:
             build_kerbside(builder, draw, side, district)
         if course.kerb(side).pavement_m:
             builder.clear_walkway(side)
+    builder.clear_places()
     if crosses and course.median_m:
         build_island(builder, draw)
     assert builder.num_objects < _MAX_OBJECTS_PER_BLOCK, f"block {block} has too many objects"
@@ -218,6 +219,13 @@ def _actor(seed: int, drive: int, stream: int, number: int) -> tuple[float, floa
     return draw.uniform(-0.3, 0.3), draw.normal(0.0, 0.08), kind(draw)
 
 
+def _in_opening(course: Course, s: float, lateral: float) -> bool:
+    """Whether a place beside the road lies in a side street."""
+    number, along_m = divmod(s, BLOCK_M)
+    opening_m = _block(course.seed, course.drive, int(number)).openings_m[math.copysign(1, lateral)]
+    return abs(along_m - BLOCK_M / 2) < opening_m / 2
+
+
 def _actors(course: Course, scan: int) -> Iterator[Builder]:
     own_s = course.position(scan)
     behind_m, ahead_m = (_BLOCKS_BEHIND - 0.1) * BLOCK_M, (_BLOCKS_AHEAD - 0.1) * BLOCK_M
@@ -240,5 +248,8 @@ def _actors(course: Course, scan: int) -> Iterator[Builder]:
             yaw_rad = 0.0 if stream.direction > 0 else math.pi
             lateral = stream.lateral_m + across
             speed = speed_m_s * section.stretch(lateral)
-            builder.body(body, (s, lateral), yaw_rad, instance, speed)
+            sunk_m = 0.0
+            if stream.kind is person and _in_opening(course, s, lateral):
+                sunk_m = course.step_up_m(lateral)
+            builder.body(body, (s, lateral), yaw_rad, instance, speed, sunk_m)
             yield builder
