@@ -64,6 +64,8 @@ def test_single_returns_of_a_scene_are_dropped_by_its_number_and_seed():
     scenes = SceneGenerator(vae, sit, norm, geometry, ODE)
     found = scenes.generate([0, 1], seed=3)
     whole = scenes.decode(found.latents)
+    with pytest.raises(ValueError, match="no latents to decode"):
+        scenes.decode(found.latents[:0])
     holes = (whole > 0) & (found.range_m < 0)
     assert holes.float().mean().item() == pytest.approx(0.12, abs=0.03)
     assert torch.equal(found.range_m, torch.where(holes, -1.0, whole))

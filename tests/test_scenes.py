@@ -66,6 +66,12 @@ def test_some_of_the_scenes_are_a_batch(labelled, some):
     assert len(chosen.latents) == len(chosen.labels) == 2
 
 
+def test_a_selection_may_be_empty(labelled):
+    for none in ([], np.array([]), slice(0)):
+        assert len(labelled[none]) == 0
+        assert labelled[none]._repr_png_() is None
+
+
 @pytest.mark.parametrize("number", [np.int64(1), torch.tensor(1)])
 def test_the_number_of_a_scene_may_be_of_numpy_or_torch(labelled, number):
     assert isinstance(labelled[number], Scene)
@@ -90,6 +96,15 @@ def test_reprs_are_one_line(labelled, edited):
 def test_an_image_in_millimetres_or_without_a_return_is_no_scan(image):
     with pytest.raises(ValueError, match=r"no return within 1\.\.56 m; ranges must be metres"):
         scan_pixels(image, PROJECTION)
+
+
+def test_returns_beyond_the_limits_are_left_out_as_of_points():
+    image = torch.full((16, 64), 20.0)
+    image[0], image[1], image[2] = 80.0, 0.5, -1.0
+    for scan in (image, Pixels(image)):
+        range_m = scan_pixels(scan, PROJECTION).range_m
+        assert (range_m[:3] == -1).all()
+        assert (range_m[3:] == 20).all()
 
 
 def test_scenes_that_are_no_scan_of_these_images(labelled):
@@ -143,6 +158,10 @@ def test_saved_scenes_are_those_of_a_sample(labelled, tmp_path):
     with pytest.raises(ValueError, match=r"metadata\.json is a file; give a folder"):
         labelled.save(folder / "metadata.json")
     labelled[:1].save(folder, overwrite=True)
+    assert len(np.load(folder / "range_m.npy")) == 1
+    diverged = replace(labelled, range_m=torch.full_like(labelled.range_m, torch.nan))
+    with pytest.raises(ValueError, match="hold NaN"):
+        diverged.save(folder, overwrite=True)
     assert len(np.load(folder / "range_m.npy")) == 1
 
 

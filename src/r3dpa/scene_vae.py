@@ -105,4 +105,6 @@ class SceneVAE:
             raise ValueError(f"latents must have shape (B, *{size}), got {tuple(latents.shape)}")
         image = self.vae.decode(latents).float()
         pixels = self.geometry.codec.pixels_of(image, projection.sensor)
+        finite = image.flatten(1).isfinite().all(dim=1)[:, None, None]
+        pixels = pixels._replace(range_m=torch.where(finite, pixels.range_m, torch.nan))
         return SceneBatch.of(pixels, latents, 0, projection)

@@ -22,6 +22,7 @@ from torch import Tensor
 
 from lidarsim.clouds import PointCloud, read_cloud
 from r3dpa.geometry import (
+    EMPTY_RANGE_M,
     SEMANTIC_CLASSES,
     BeamProjection,
     Pixels,
@@ -67,14 +68,13 @@ def scan_pixels(scan: ScanLike, projection: Projection, labels: ArrayLike | None
         classes = None if scan.labels is None else classes_of(scan.labels.cpu())
         scan = Pixels(scan.range_m, scan.intensity, classes)
     if isinstance(scan, Pixels):
-        _check_range_image(scan.range_m, projection)
-        return map_pixels(torch.Tensor.cpu, scan)
+        scan = map_pixels(torch.Tensor.cpu, scan)
+        return scan._replace(range_m=_within_limits(scan.range_m, projection))
     points, own_labels = _points_of_scan(scan)
     values = torch.as_tensor(points).detach().cpu().float()
     sensor = projection.sensor
     if values.shape == (sensor.beams, sensor.columns):
-        _check_range_image(values, projection)
-        return Pixels(values)
+        return Pixels(_within_limits(values, projection))
     if values.ndim != 2 or values.shape[1] not in (3, 4):
         raise ValueError(
             f"a scan must be points (P, 3) or (P, 4), or a range image ({sensor.beams}, "
@@ -111,8 +111,11 @@ def _points_of_scan(scan: ScanLike) -> tuple[Any, ArrayLike | None]:
     return np.column_stack([scan.points, np.asarray(intensity, dtype=np.float32)]), labels
 
 
-def _check_range_image(range_m: Tensor, projection: Projection) -> None:
-    """Refuse images of another size, and without a return within the limits of the sensor."""
+def _within_limits(range_m: Tensor, projection: Projection) -> Tensor:
+    """Range image without returns beyond the limits of the sensor, as of points.
+
+    Refuses images of another size, and without a return within the limits.
+    """
     sensor = projection.sensor
     if range_m.shape != (sensor.beams, sensor.columns):
         raise ValueError(
@@ -121,11 +124,13 @@ def _check_range_image(range_m: Tensor, projection: Projection) -> None:
         )
     if not range_m.isfinite().all():
         raise ValueError("the range image has NaN or infinite values; leave these pixels empty")
-    if not ((range_m >= sensor.range_min_m) & (range_m <= sensor.range_max_m)).any():
+    within = (range_m >= sensor.range_min_m) & (range_m <= sensor.range_max_m)
+    if not within.any():
         raise ValueError(
             f"the range image has no return within {sensor.range_min_m:g}.."
             f"{sensor.range_max_m:g} m; ranges must be metres"
         )
+    return torch.where(within, range_m, EMPTY_RANGE_M)
 
 
 def warn_of_points_outside_view(points: Tensor, projection: Projection) -> None:
@@ -257,7 +262,7 @@ class SceneBatch:
     def __getitem__(self, index: int | slice | list[int] | np.ndarray | Tensor) -> Scene | Self:
         """One scene, or a batch of some."""
         if isinstance(index, list | np.ndarray):
-            index = torch.as_tensor(index)
+            index = torch.as_tensor(index) if len(index) else torch.zeros(0, dtype=torch.long)
         if isinstance(index, slice) or (isinstance(index, Tensor) and index.ndim > 0):
             values = {field.name: getattr(self, field.name) for field in fields(self)}
             parts: dict[str, Any] = {
@@ -299,8 +304,8 @@ class SceneBatch:
             overwrite: Replace earlier scenes.
 
         Raises:
-            ValueError: If a format is unknown, or the folder is a file, or holds scenes and
-                ``overwrite`` is False.
+            ValueError: If a format is unknown, a scene holds NaN, or the folder is a file, or holds
+                scenes and ``overwrite`` is False.
         """
         from r3dpa.data.scene_writer import SceneWriter
 
@@ -311,6 +316,8 @@ class SceneBatch:
             raise ValueError(
                 f"{folder} holds scenes already; give another folder or overwrite=True"
             )
+        if self.range_m.isnan().any():
+            raise ValueError("the scenes hold NaN: the networks diverged; sample in fp32")
         formats = (formats,) if isinstance(formats, str) else tuple(formats)
         about = {"num": len(self), "nfe": self.nfe, "formats": list(formats)}
         with SceneWriter(folder, len(self), self.projection, formats, about, overwrite) as writer:
@@ -356,8 +363,10 @@ class SceneBatch:
             clouds.append(cloud)
         return clouds
 
-    def _repr_png_(self) -> bytes:
+    def _repr_png_(self) -> bytes | None:
         """Range images of the first scenes, as the output of a notebook cell."""
+        if not len(self):
+            return None
         from PIL import Image
 
         from r3dpa.viz import range_image_picture

@@ -331,6 +331,15 @@ def test_bad_input_is_refused_before_networks_run(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("command", ["vary", "complete --keep_every 2"])
+def test_no_edit_writes_into_the_folder_of_its_scans(files, tmp_path, command):
+    write_bin(tmp_path / "scans" / "a.bin", read_scan(files / "a.bin"))
+    name, *more = command.split()
+    with pytest.raises(ValueError, match=r"scans/a\.bin lies in --out .*: give another folder"):
+        edit(files, name, tmp_path, "--scan", tmp_path / "scans/a.bin", "--overwrite", *more)
+    assert (tmp_path / "scans" / "a.bin").exists()
+
+
 @pytest.mark.parametrize(
     "words",
     [

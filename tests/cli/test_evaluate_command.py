@@ -97,6 +97,11 @@ def test_a_second_judge_has_rows_of_its_own(data, samples, tmp_path, no_figures)
         evaluate(*words, "--ckpt.fwid_judge", files[1])
 
 
+def test_a_reference_of_another_format_is_refused_before_scans_are_read(data, tmp_path):
+    with pytest.raises(ValueError, match=r"ref\.npy: must be a \.safetensors file"):
+        command.reference(data=data, out=tmp_path / "ref.npy", spaces=("fgeo",))
+
+
 def test_samples_are_compared_with_a_reference(data, samples, tmp_path, capsys):
     """In the default spaces, on few scans and samples: FWID is a large network."""
     reference, out = tmp_path / "ref.safetensors", tmp_path / "results"

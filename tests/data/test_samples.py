@@ -1,5 +1,6 @@
 import io
 import pickle
+import shutil
 
 import numpy as np
 import pytest
@@ -7,6 +8,7 @@ import torch
 
 from lidarsim.scan_files import ScanError, write_bin, write_npz, write_ply
 from r3dpa.data.samples import read_samples
+from r3dpa.data.scans import scan_files
 from r3dpa.geometry import EMPTY_RANGE_M, LidarSensor, SphericalProjection, range_image, unproject
 
 SENSOR = LidarSensor(beams=4, columns=8)
@@ -96,6 +98,11 @@ def test_folder_of_r3dpa_sample_is_read_once(tmp_path):
     (tmp_path / "scenes.npz").unlink()
     names = [sample.name for sample in read_samples(tmp_path, SENSOR)]
     assert names == ["bin/000000", "bin/000001"]
+    shutil.rmtree(tmp_path / "bin")
+    np.save(tmp_path / "range_m.npy", np.ones((2, 64, 1024), np.float32))
+    names = [sample.name for sample in read_samples(tmp_path, SENSOR)]
+    assert names == ["000000", "000001"]
+    assert [file.suffix for file in scan_files(tmp_path)] == [".ply", ".ply"]
 
 
 @pytest.mark.parametrize("order", ["C", "F"])

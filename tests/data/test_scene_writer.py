@@ -84,6 +84,12 @@ def test_an_error_before_the_first_scene_leaves_nothing(tmp_path):
     with pytest.raises(RuntimeError), writer(tmp_path, 2):
         raise RuntimeError
     assert files(tmp_path) == []
+    broken = scenes(3)
+    broken[1] = torch.nan  # after the points of the first scene are written
+    for _ in range(2):  # and the folder can be written again
+        with pytest.raises(ValueError, match=r"scene 000001 of .* holds NaN"):
+            write(tmp_path, broken, batch=3)
+        assert files(tmp_path) == []
 
 
 def test_a_run_that_stops_before_its_last_file_only_needs_that(tmp_path):
@@ -229,6 +235,14 @@ def test_writing_goes_on_beside_drawing(tmp_path, monkeypatch):
         second.join(10)
         open_writer.close()
         assert open_writer.num_done == 2
+
+
+def test_pictures_of_replaced_scenes_go_with_them(tmp_path):
+    write(tmp_path, scenes(3))
+    for name in ("scenes.png", "scenes.html", "classes.png"):
+        (tmp_path / name).touch()
+    write(tmp_path, scenes(1), overwrite=True)
+    assert files(tmp_path) == ["bin/000000.bin", "metadata.json", "range_m.npy"]
 
 
 def test_files_of_somebody_else_are_never_removed(tmp_path):

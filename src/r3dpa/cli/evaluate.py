@@ -54,6 +54,8 @@ def reference(
     from r3dpa.metrics.scene import PROTOCOLS, EvaluationScene
 
     check_file(out)
+    if out.suffix != ".safetensors":
+        raise ValueError(f"--out {out}: must be a .safetensors file, the format of a reference")
     if out.exists():
         raise ValueError(f"{out} exists: delete it, or give another --out")
     module = read_data(data, columns)

@@ -113,7 +113,7 @@ def find_labels(scan: str | Path, num_points: int) -> NDArray[np.int64] | None:
     simulated = read_beside(scan, "labels")
     if simulated is not None:
         return simulated.astype(np.int64)
-    path = scan.absolute().parents[1] / "labels" / f"{scan.stem}.label"
+    path = scan.absolute().parent.parent / "labels" / f"{scan.stem}.label"
     if scan.parent.name == "velodyne" and path.exists():
         return _semantic_kitti(path, num_points)
     return None

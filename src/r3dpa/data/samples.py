@@ -116,8 +116,8 @@ def read_samples(
 
     Points and pixels outside the range limits are left out. One sample is in memory at a time, of
     ``.npz`` one array, of ``.pth`` one file. The folders that ``r3dpa sample`` and the official
-    R3DPA write hold each scene several times; of these ``scenes.npz``, else ``bin/*.bin``, and
-    ``numpy/img.npz`` are read.
+    R3DPA write hold each scene several times; of these ``scenes.npz``, else ``bin/*.bin``, else
+    ``ply/*.ply``, else ``range_m.npy``, and ``numpy/img.npz`` are read.
 
     Args:
         path: File or folder, whose files are read in the order of their names.
@@ -141,8 +141,9 @@ def _find(folder: Path) -> list[tuple[str, Path]]:
     for place, known in (("numpy/img.npz", True), ("scenes.npz", ours)):
         if known and (folder / place).is_file():
             return [("", folder / place)]
-    if ours and (folder / "bin").is_dir():
-        folder = folder / "bin"
+    clouds = [folder / name for name in ("bin", "ply") if ours and (folder / name).is_dir()]
+    if clouds:
+        folder = clouds[0]
     files: dict[str, list[Path]] = {}
     for file in sorted(files_below(folder)):
         if file.suffix.lower() in _READERS:

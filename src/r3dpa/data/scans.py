@@ -146,7 +146,10 @@ def scan_files(entry: str | Path) -> Iterator[Path]:
         for drive in (path / RAW).iterdir():
             yield from _drive_files(drive)
     elif path.is_dir():
-        yield from _of_one_format(path, files_below(path))
+        files: Iterable[Path] = files_below(path)
+        if (path / "metadata.json").is_file():  # scenes of r3dpa, with range images beside clouds
+            files = [file for file in files if file.name not in ("range_m.npy", "before.npy")]
+        yield from _of_one_format(path, files)
     elif path.is_file():
         yield path
     elif has_magic(str(entry)):

@@ -42,6 +42,9 @@ _WRITTEN = (
     "range",
     "birds_eye",
     "scene_3d",
+    "scenes.png",
+    "scenes.html",
+    "classes.png",
     "before.npy",
     "mask.png",
     "edit.png",
@@ -124,7 +127,7 @@ class SceneWriter:
             self._file.close()
             self._journal.close()
             if error is not None and not self.num_done:
-                self._unfinished.unlink(missing_ok=True)
+                self._delete_scenes()
                 self._journal.delete()
         if error is None:
             self._wait()
@@ -231,7 +234,10 @@ class SceneWriter:
         self.out.mkdir(parents=True, exist_ok=True)
         self._start_journal(0, 0)
         metadata.unlink(missing_ok=True)
-        for path in (self._unfinished, *written):
+        self._delete_scenes()
+
+    def _delete_scenes(self) -> None:
+        for path in (self._unfinished, *(self.out / name for name in _WRITTEN)):
             if path.is_dir():
                 shutil.rmtree(path)
             else:

@@ -31,7 +31,7 @@ from r3dpa.geometry import (
     values_at_returns,
 )
 from r3dpa.io import in_processes, number_of
-from r3dpa.scene_files.edits import EditSession, ScanView
+from r3dpa.scene_files.edits import EditSession, ScanView, refuse_inside
 from r3dpa.scene_files.options import EditOptions
 
 _SCANS = "scans"  # folder of the completed scans
@@ -150,6 +150,7 @@ def complete_files(
     """Complete a scan or all scans of a folder; return a summary with errors."""
     root, paths = find_files(source)
     options, num = job.options, job.num
+    refuse_inside(options.out, paths)
     session = _session(options, num)
     stage = session.checkpoint.stage
     if job.start is not None and session.baseline is not None:

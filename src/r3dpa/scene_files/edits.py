@@ -52,6 +52,13 @@ class ScanView(NamedTuple):
     pixels: Pixels
 
 
+def refuse_inside(out: Path, scans: Iterable[Path]) -> None:
+    """Refuse to write into a folder that scans are read from, which ``--overwrite`` would empty."""
+    for path in scans:
+        if path.resolve().is_relative_to(out.resolve()):
+            raise ValueError(f"{path} lies in --out {out}: give another folder as --out")
+
+
 class EditSession:
     """A checkpoint opened for one edit with ``num`` results; None is the default guidance.
 
@@ -196,6 +203,7 @@ class EditSession:
         """
         options = self.options
         paths = {name: scan.path for name, scan in scans.items()}
+        refuse_inside(options.out, paths.values())
         request = self.request(command, arguments, {"scans": paths}, guided)
         with SceneWriter(
             options.out, self.num, self.projection, options.formats, request, options.overwrite
