@@ -26,6 +26,7 @@ else
 ifeq ($(DATA),)
 SOURCE := --config conf/r3dpa_s/demo_data.yaml
 REAL := conf/r3dpa_s/demo_data.yaml
+HELD_OUT := --split val
 else
 SOURCE := --config conf/r3dpa_s/demo_folder.yaml --data.init_args.scans '$(DATA)'
 REAL := $(DATA)
@@ -124,7 +125,7 @@ demo: $(READY)
 	$(BIN)/r3dpa sample --num 16 --out '$(OUT)/r3dpa-s' --overwrite true
 	$(BIN)/r3dpa edit inpaint --scan '$(OUT)/r3dpa-s/bin/000000.bin' --box -30 30 -25 3 --num 2 \
 		--out '$(OUT)/edit' --overwrite true
-	$(BIN)/r3dpa data reference --data '$(REAL)' --num 32 --out '$(OUT)/reference.safetensors'
+	$(BIN)/r3dpa data reference --data '$(REAL)' $(HELD_OUT) --num 32 --out '$(OUT)/reference.safetensors'
 	$(BIN)/r3dpa evaluate --samples '$(OUT)/r3dpa-s' --reference '$(OUT)/reference.safetensors' \
 		--allow_few --label before --out '$(OUT)/before'
 	$(FIT) --config conf/r3dpa_s/vae_alignment.yaml --config conf/r3dpa_s/demo_vae.yaml --run_dir '$(OUT)/vae'
@@ -162,7 +163,7 @@ my-sensor: $(READY) ## r3dpa-s in the geometry of your sensor: make my-sensor DA
 	@cat '$(MINE)/more.txt'
 
 gallery: $(READY) ## one page of 64 scenes in order, their nearest training scans, edits, weather
-	$(BIN)/r3dpa gallery --out runs/gallery.html $(if $(wildcard runs/r3dpa_s/data),--data conf/r3dpa_s/data.yaml)
+	$(BIN)/r3dpa gallery --out runs/gallery.html $(if $(wildcard $(SECOND)/data),--data conf/r3dpa_s_2/data.yaml)
 
 r3dpa-s: $(READY) ## train the second edition of r3dpa-s: 20 hours of a core; stop and repeat at any time [SCANS=8000]
 	OMP_NUM_THREADS=1 nice -n 19 $(BIN)/r3dpa data prepare $(SECOND_DATA)

@@ -119,6 +119,7 @@ def test_released_files_stand_for_trainings(tmp_path, monkeypatch):
     (stage,) = rows["table_1", "r2dm"].stages[0]
     sampled, test = jobs[stage.name], jobs[f"test of {stage.name}"]
     assert sampled.words[:3] == ["sample", "--ckpt", str(weights)]
+    assert "--steps" not in sampled.words  # a baseline has a published sampler
     assert test.words[:3] == ["evaluate", "--samples", sampled.words[4]]
     assert (test.needs, test.makes) == ((stage.name, "reference"), stage.evaluation)
     (stage,) = rows["table_1", "ultralidar"].stages[0]
@@ -127,6 +128,21 @@ def test_released_files_stand_for_trainings(tmp_path, monkeypatch):
     next(stage for stage in plan.stages if stage.on_features).config["scorer"]["num_scenes"] += 1
     again = {job.name: job for job in plan_jobs(plan)}
     assert again[test.name].content != test.content  # of other samples
+
+
+def test_released_weights_are_sampled_and_measured_as_trained_ones(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    weights = tmp_path / "r3dpa.pt"
+    weights.write_bytes(b"weights")
+    plan = plan_of("paper", released={"r3dpa": weights})
+    jobs = {job.name: job for job in plan_jobs(plan)}
+    (stage,) = rows_of(plan)["table_1", "r3dpa"].stages[0]
+    sampled, test = jobs[stage.name].words, jobs[f"test of {stage.name}"].words
+    assert sampled[sampled.index("--steps") + 1] == "256"
+    assert sampled[sampled.index("--solver") + 1] == "euler_maruyama"
+    assert sampled[sampled.index("--precision") + 1] == "bf16"
+    assert test[test.index("--spaces") + 1] == "frid,fld,fsvd,fpvd,fwid,fgeo"
+    assert test[test.index("--ckpt.frid") + 1] == "data/weights/frid.ckpt"
 
 
 ROW = {"label": "x", "commands": {"a": "r3dpa fit joint"}}

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from tiny_evaluations import evaluation
 
 from r3dpa.ablation import write_table
 from r3dpa.ablation.plan import Plan, PlannedStage, Row, Table
-from r3dpa.ablation.tables import mean_of_seeds, order_results
+from r3dpa.ablation.tables import mean_of_seeds, order_results, relative_change
 from r3dpa.metrics.results import Evaluation, MetricResult
 
 RECORDED = Path(__file__).resolve().parents[2] / "notebooks" / "results" / "ablation_demo"
@@ -36,6 +37,19 @@ def test_released_weights_keep_their_interval_over_scenes(tmp_path):
     write_table(Plan(tmp_path, "demo", "", [], (0, 1, 2), [table]), table, {})
     (line,) = csv.DictReader((tmp_path / "t.csv").read_text().splitlines())
     assert (float(line["low"]), float(line["high"])) == pytest.approx((0.4, 0.6))
+
+
+def test_a_side_that_is_one_run_has_the_interval_of_its_scenes():
+    released = {seed: evaluation(JSD=5.0) for seed in (0, 1, 2)}
+    other = {seed: evaluation(JSD=4.9) for seed in (0, 1, 2)}
+    one = relative_change({0: other[0]}, {0: released[0]}, "JSD")
+    assert relative_change(other, released, "JSD") == one
+    assert one[1][1] - one[0] == pytest.approx(math.hypot(0.1, 0.1) / 5)
+    trained = {seed: evaluation(JSD=4.9 + seed / 100) for seed in (0, 1, 2)}
+    mean, (low, high) = relative_change(trained, released, "JSD")
+    seeds = 4.3027 * 0.01 / 5 / 3**0.5  # Student's t of two degrees of freedom
+    assert (high - low) / 2 == pytest.approx(math.hypot(seeds, 0.1 / 5), rel=1e-3)
+    assert mean == pytest.approx(-0.09 / 5)
 
 
 @pytest.mark.parametrize(

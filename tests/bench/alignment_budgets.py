@@ -34,7 +34,7 @@ def evaluation_at(stage, steps, last, reference, scenes):
     """Evaluation of a training after some steps; tests its checkpoint if nothing has."""
     if steps == last:
         return Evaluation.load(stage / "evaluation" / "evaluation.json")
-    folder = stage / f"step_{steps}"
+    folder = stage / f"step_{steps}_{scenes}"
     path = folder / "evaluation" / "evaluation.json"
     if not path.is_file():
         words = ["test", "--config", stage / "config.yaml", "--run_dir", folder]
@@ -68,8 +68,10 @@ def changes(values, base):
 def compare(rows, base, seconds):
     """Rows with changes to the base at equal steps and at equal hours.
 
-    ``rows`` are values by row, steps, metric and seed.
+    ``rows`` are values by row, steps, metric and seed. The base is interpolated between its
+    budgets; beyond them, ``equal_hours`` is None.
     """
+    base_hours = [steps * seconds[base] / 3600 for steps in rows[base]]
     results = {}
     for name, by_steps in rows.items():
         results[name] = {}
@@ -78,17 +80,16 @@ def compare(rows, base, seconds):
             row = {"hours": hours}
             for metric, values in by_metric.items():
                 same = rows[base][steps][metric]
-                at_hours = {
-                    seed: np.interp(
-                        hours,
-                        [each * seconds[base] / 3600 for each in rows[base]],
-                        [of[metric][seed] for of in rows[base].values()],
-                    )
-                    for seed in same
-                }
                 row[metric] = {"mean": fmean(values.values()), "values": values}
-                row[metric] |= {"equal_steps": changes(values, same)}
-                row[metric] |= {"equal_hours": changes(values, at_hours)}
+                row[metric] |= {"equal_steps": changes(values, same), "equal_hours": None}
+                if base_hours[0] <= hours <= base_hours[-1]:
+                    at_hours = {
+                        seed: np.interp(
+                            hours, base_hours, [of[metric][seed] for of in rows[base].values()]
+                        )
+                        for seed in same
+                    }
+                    row[metric]["equal_hours"] = changes(values, at_hours)
             results[name][steps] = row
     return results
 

@@ -203,7 +203,7 @@ def mixing(editors, scans, teacher):
                 rows.append((cosines[side], cosines[1 - side], seconds))
         means = np.mean(rows, axis=0).tolist()
         results[how] = dict(zip(("own", "other", "seconds"), means, strict=True))
-    return {"scenes": len(rows) // 2, **results}
+    return {"scenes": len(scans) // 2, **results}
 
 
 def main(arguments=None):

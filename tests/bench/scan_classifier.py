@@ -82,7 +82,8 @@ def train_classifier(
     if count < 4:
         raise ValueError(f"a classifier needs at least 4 scans and 4 scenes, got {count}")
     generator = torch.Generator().manual_seed(seed)
-    cut, half = round(_SHARE_OF_TRAINING * count), batch_size // 2
+    cut = round(_SHARE_OF_TRAINING * count)
+    half = min(batch_size // 2, cut)
     train, held_out = [], []
     for images in (real_m, generated_m):
         order = torch.randperm(len(images), generator=generator)[:count]

@@ -114,18 +114,22 @@ def without_parts(images: Images) -> dict[str, Tensor]:
     return variants
 
 
-def fill_lost(range_m, axis):
-    """Images whose empty pixels take the range of the last return before them."""
+def last_returns(range_m, axis):
+    """Place along an axis of the last return up to each pixel; 0 without one."""
     place = torch.arange(range_m.shape[axis])
     place = (place if axis == -1 else place[:, None]).expand_as(range_m)
-    last = torch.where(range_m > 0, place, 0).cummax(axis).values
-    return range_m.gather(axis, last)
+    return torch.where(range_m > 0, place, 0).cummax(axis).values
+
+
+def fill_lost(range_m, axis):
+    """Images whose empty pixels take the range of the last return before them."""
+    return range_m.gather(axis, last_returns(range_m, axis))
 
 
 def keep_streets(images: Images) -> Images:
     """Upper half of the images, what was lost filled from above: without marks of the sensor."""
-    rows = slice(0, STREET_ROWS)
-    return Images(fill_lost(images.range_m, axis=-2)[:, rows], images.height_m[:, rows])
+    last = last_returns(images.range_m, axis=-2)[:, :STREET_ROWS]
+    return Images(images.range_m.gather(-2, last), images.height_m.gather(-2, last))
 
 
 def saliency(network, range_m):

@@ -28,6 +28,7 @@ def test_changes_at_equal_steps_and_hours_by_hand(tmp_path):
     assert row["equal_steps"]["change"] == pytest.approx(-0.5)
     assert row["equal_steps"]["interval"] == pytest.approx([-0.5, -0.5])
     assert row["equal_hours"]["change"] == pytest.approx(0)
+    assert found["aligned"][200]["FWID"]["equal_hours"] is None  # the base has no such budget
     last = found["aligned"][200]["FWID"]["equal_steps"]
     assert last["change"] == pytest.approx((-0.5 - 0.75) / 2)
     # Student's t of one degree of freedom is 12.7; the standard error of -0.5 and -0.75 is 0.125.

@@ -23,6 +23,11 @@ def test_equal_sets_cannot_be_told_apart_and_speckled_ones_can():
     assert speckled.value > 0.9
 
 
+def test_few_images_train_it_too():
+    near, far = (torch.full((10, 16, 64), distance_m) for distance_m in (5.0, 40.0))
+    assert classifier_accuracy(near, far, epochs=12).value == 1
+
+
 def test_sets_that_cannot_be_compared_are_refused():
     with pytest.raises(ValueError, match="one size"):
         classifier_accuracy(scenes(8, 0), scenes(8, 1)[:, :8])

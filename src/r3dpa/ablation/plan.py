@@ -47,8 +47,8 @@ class PlannedStage(NamedTuple):
 
     The name is the experiment, a hash of all that the training depends on, and the seed. ``words``
     follow ``r3dpa fit``, ``config`` is what they amount to with seed 0, and ``before`` names the
-    stages that it starts from. Released weights or samples have their path alone as ``words``, and
-    no configuration.
+    stages that it starts from. Released weights or samples have as ``words`` their path and options
+    of ``r3dpa sample``, and no configuration.
     """
 
     name: str
@@ -179,7 +179,10 @@ def _plan_table(
         published = row.get("published", {})
         _check_keys(f"{where}: published", published, (), tuple(PUBLISHED_SCALES))
         if key in released:
-            chain = [_released_stage(released[key], planner.out)]
+            trained = (
+                planner.plan_row(file.stem, row["commands"], where) if "commands" in row else []
+            )
+            chain = [_released_stage(released[key], planner.out, _sampling_of(trained))]
             stages = dict.fromkeys(seeds, chain)
         elif "commands" in row:
             chain = planner.plan_row(file.stem, row["commands"], where)
@@ -280,13 +283,26 @@ def _seed_words(seed: int) -> list[str]:
     return [word for key in _SEEDS for word in (f"--{key}", str(seed))]
 
 
-def _released_stage(path: Path, out: Path) -> PlannedStage:
+def _sampling_of(chain: Sequence[PlannedStage]) -> list[str]:
+    """Options of ``r3dpa sample`` as in the test of a row; baselines know their own."""
+    if not chain or chain[-1].config["model"]["class_path"].startswith("r3dpa.baselines"):
+        return []
+    scorer = chain[-1].config["scorer"]
+    options = {name: scorer["sampler"][name] for name in ("solver", "steps")}
+    options["precision"] = scorer["precision"]
+    if scorer["sampler"]["shift"] != 1:
+        options["shift"] = scorer["sampler"]["shift"]
+    return [word for name, value in options.items() for word in (f"--{name}", str(value))]
+
+
+def _released_stage(path: Path, out: Path, sampling: list[str]) -> PlannedStage:
     """Stage of released weights or samples."""
     if not path.exists():
         raise ValueError(f"--released {path} does not exist")
     content = _digest(path) if path.is_file() else str(path.resolve())
-    name = f"released-{hashlib.sha256(content.encode()).hexdigest()[:10]}"
-    return PlannedStage(name, out / "stages" / name, [str(path)], {}, (), on_scans=False)
+    about = " ".join([content, *sampling])
+    name = f"released-{hashlib.sha256(about.encode()).hexdigest()[:10]}"
+    return PlannedStage(name, out / "stages" / name, [str(path), *sampling], {}, (), on_scans=False)
 
 
 def _read(path: Path, needed: Sequence[str], optional: Sequence[str]) -> dict[str, Any]:

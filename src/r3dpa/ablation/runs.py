@@ -212,17 +212,22 @@ def _released_jobs(
     stage: PlannedStage, reference: Path, of_reference: str, scorer: dict[str, Any]
 ) -> list[Job]:
     """Samples of released weights, as many as of trained ones, and their comparison."""
-    (given,) = stage.words
+    given, *sampling = stage.words
     samples, num = stage.folder / "samples", str(scorer["num_scenes"])
     jobs = []
     if Path(given).is_file():
         words = ["sample", "--ckpt", given, "--out", str(samples), "--num", num, "--pictures", "0"]
+        words += sampling
         jobs.append(Job(stage.name, words, stage.folder / "sample", f"{stage.name} {num}"))
         given = str(samples)
     words = ["evaluate", "--samples", given, "--reference", str(reference), "--skip_bad", "true"]
     words += ["--allow_few", str(scorer["allow_few"]).lower()]
     words += ["--out", str(stage.evaluation.parent)]
+    spaces, weights = scorer["spaces"], scorer["ckpt"] or {}
+    if spaces is not None:
+        words += ["--spaces", ",".join(spaces)]
+    words += [word for space, path in weights.items() for word in (f"--ckpt.{space}", str(path))]
     needs = (*(job.name for job in jobs), "reference")
-    content = f"{of_reference} {given} {num} {scorer['allow_few']}"
+    content = f"{of_reference} {given} {num} {scorer['allow_few']} {spaces} {weights}"
     test = f"test of {stage.name}"
     return [*jobs, Job(test, words, stage.folder / "test", content, needs, stage.evaluation)]

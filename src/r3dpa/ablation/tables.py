@@ -81,21 +81,25 @@ def relative_change(
 ) -> tuple[float, Ends] | None:
     """Return the difference of two trainings relative to the second, and its 95 % interval.
 
-    The mean over the seeds that both have, with Student's interval of the differences seed by seed;
-    with a single seed the interval over the scenes, without the noise of training. None without a
-    value.
+    The mean over the seeds that both have, with Student's interval of the differences seed by seed.
+    A side that is one run, with a single seed or as released weights, has the interval over its
+    scenes, without the noise of training. None without a value.
     """
-    changes, half = [], 0.0
+    changes, pairs, scale = [], [], 1.0
     for seed in ours.keys() & theirs.keys():
         a, b = ours[seed].row(metric), theirs[seed].row(metric)
         if a and b and a.value is not None and b.value:
-            changes.append((a.value - b.value) / abs(b.value))
-            half = math.hypot(a.half_width, b.half_width) / abs(b.value)
+            scale = abs(b.value)
+            changes.append((a.value - b.value) / scale)
+            pairs.append((a, b))
     if not changes:
         return None
+    sides = list(zip(*pairs, strict=True))
+    one_run = [rows[0] for rows in sides if len({row.value for row in rows}) == 1]
+    half = math.hypot(*(row.half_width for row in one_run)) / scale
+    if len(one_run) < len(sides):
+        half = math.hypot(half, _half_width(changes))
     mean = fmean(changes)
-    if len(changes) > 1:
-        half = _half_width(changes)
     return mean, (mean - half, mean + half)
 
 
