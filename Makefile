@@ -30,6 +30,7 @@ HELD_OUT := --split val
 else
 SOURCE := --config conf/r3dpa_s/demo_folder.yaml --data.init_args.scans '$(DATA)'
 REAL := $(DATA)
+HELD_OUT :=
 endif
 FIT := $(BIN)/r3dpa fit --config conf/trainer.yaml --config conf/r3dpa_s/trainer.yaml $(SOURCE)
 endif
