@@ -358,7 +358,7 @@ class SceneGenerator:
         if indices is not None and len(indices) != len(latents):
             raise ValueError(f"{len(latents)} scenes need as many indices, got {len(indices)}")
         if not len(latents):
-            raise ValueError("there are no latents to decode: give the latents of one scene or more")
+            raise ValueError("there are no latents to decode: give latents of one scene or more")
         size = self.batch_size or len(latents)
         sensor, codec, parts = self.geometry.projection.sensor, self.geometry.codec, []
         for first in range(0, len(latents), size):
