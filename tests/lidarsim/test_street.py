@@ -208,21 +208,19 @@ def test_walkers_cross_side_streets_on_the_road():
 
 
 def test_nobody_stands_in_things_and_no_bin_in_others():
-    standing_people = bins = 0
-    people, trash = Semantic.PERSON, Semantic.TRASH_BIN
+    counts = {Semantic.PERSON: 0, Semantic.TRASH_BIN: 0}
     for drive in range(7):
         for block in range(30):
             builder = street_module._block(0, drive, block)
             solids = [p for p in (*builder.primitives, *builder.details) if p.instance]
             solids = [p for p in solids if p.material != Material.FOLIAGE]
-            for p in solids:
-                if p.semantic in (people, trash):
-                    others = [q for q in solids if q.semantic not in {p.semantic, people}]
-                    assert not any(inside(q, [p.centre]).any() for q in others)
-                    standing_people += p.semantic == people
-                    bins += p.semantic == trash
-    assert standing_people > 300
-    assert bins > 100
+            for semantic in counts:
+                centres = [p.centre for p in solids if p.semantic == semantic]
+                others = [p for p in solids if p.semantic not in (semantic, Semantic.PERSON)]
+                counts[semantic] += len(centres)
+                assert not any(inside(p, centres).any() for p in others if centres)
+    assert counts[Semantic.PERSON] > 300
+    assert counts[Semantic.TRASH_BIN] > 100
 
 
 def test_cars_park_in_the_direction_of_the_traffic_on_their_side():
