@@ -22,7 +22,13 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from r3dpa import __version__
-from r3dpa.checkpoints.networks import Checkpoint, NetworkState, path_of, recorded_facts
+from r3dpa.checkpoints.networks import (
+    Checkpoint,
+    NetworkState,
+    check_same_arguments,
+    path_of,
+    recorded_facts,
+)
 from r3dpa.checkpoints.official import OURS, from_official, is_official, statistics_of, to_official
 from r3dpa.class_paths import current_network
 from r3dpa.io import (
@@ -299,7 +305,7 @@ def _with_flow_of(checkpoint: Checkpoint, other: Checkpoint) -> Checkpoint:
         )
     networks = dict(checkpoint.networks)
     for name in _FLOW & networks.keys():
-        _check_same_arguments(name, checkpoint, other)
+        check_same_arguments(name, checkpoint, other)
         weights, given = networks[name].state_dict, other.network(name).state_dict
         flow = {key: value for key, value in given.items() if not key.startswith(_FEW_STEPS)}
         needed = {key for key in weights if not key.startswith(_FEW_STEPS)}
@@ -312,17 +318,6 @@ def _with_flow_of(checkpoint: Checkpoint, other: Checkpoint) -> Checkpoint:
                 )
         networks[name] = replace(networks[name], state_dict={**weights, **flow})
     return replace(checkpoint, networks=networks, sampling=other.sampling)
-
-
-def _check_same_arguments(name: str, checkpoint: Checkpoint, other: Checkpoint) -> None:
-    """Refuse a network that computes something else with weights of the same shapes."""
-    here, there = checkpoint.network(name).arguments, other.network(name).arguments
-    for key in ("input_size", "num_heads", "alignment_depth"):
-        if key in here and here[key] != there.get(key):
-            raise ValueError(
-                f"the flow of {other.path} does not fit {checkpoint.path}: {name} has {key} "
-                f"{there.get(key)} there and {here[key]} here"
-            )
 
 
 def _check_same_latents(checkpoint: Checkpoint, other: Checkpoint) -> None:

@@ -309,6 +309,17 @@ def _different_settings(state: NetworkState, network: nn.Module) -> list[str]:
     return differences
 
 
+def check_same_arguments(name: str, checkpoint: Checkpoint, other: Checkpoint) -> None:
+    """Refuse a network of ``other`` that computes something else with weights of these shapes."""
+    here, there = checkpoint.network(name).arguments, other.network(name).arguments
+    for key in _SHAPELESS_ARGS:
+        if key in here and here[key] != there.get(key):
+            raise ValueError(
+                f"the flow of {other.path} does not fit {checkpoint.path}: {name} has {key} "
+                f"{there.get(key)} there and {here[key]} here"
+            )
+
+
 def _shorten(lines: list[str]) -> list[str]:
     rest = len(lines) - _NUM_LISTED
     return lines if rest <= 0 else [*lines[:_NUM_LISTED], f"... and {rest} more"]

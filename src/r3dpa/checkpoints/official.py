@@ -178,9 +178,9 @@ def _check_official_vae(checkpoint: Checkpoint) -> None:
             f"the VAE of {checkpoint.path} wraps columns when it upsamples: only one built with "
             "legacy_upsample=True has an official counterpart"
         )
+    given = {**arguments, "stem": tuple(arguments["stem"])}
     for name, official in (("in_channels", 1), ("modes", 1), ("stem", (1, 1))):
-        value = arguments[name]
-        if (tuple(value) if isinstance(official, tuple) else value) != official:
+        if (value := given[name]) != official:
             raise ValueError(
                 f"the VAE of {checkpoint.path} has {name} {value}: only one with {name} {official} "
                 "has an official counterpart"

@@ -116,7 +116,7 @@ def replay(file: Path, ckpt: Path, device: str = "cpu") -> str:
         **networks,
         weights=settings,
         path=saved["path"],
-        latent_noise=saved.get("latent_noise", 0.0),
+        latent_noise=saved["latent_noise"],
     ).to(device)
     if weights.geometry is not None:
         module.geometry = ScanGeometry.from_dict(dict(weights.geometry))

@@ -31,6 +31,7 @@ from r3dpa.io import text_table
 from r3dpa.modules.checks import (
     check_image,
     check_latents,
+    check_path,
     check_planned_images,
     planned_geometry,
 )
@@ -260,16 +261,10 @@ class GenerativeModule(Stage):
 
         Average velocities of stage few_step are left out, and so are refinement, intensity and
         class of a VAE where this run has none, and projection heads that this run cannot use.
-
-        Raises:
-            ValueError: If its velocities, where this run starts from them, are of another path.
+        ``ValueError`` for velocities of another path.
         """
-        has_velocity = "sit" in self.init_networks and {"sit", "ema"} & before.networks.keys()
-        if has_velocity and before.interpolant != self.interpolant.path:
-            raise ValueError(
-                f"{before.path} was trained on the {before.interpolant} path: set "
-                "--model.init_args.path to it"
-            )
+        if "sit" in self.init_networks:
+            check_path(before, self.interpolant.path)
         networks = {}
         for name, state in before.networks.items():
             flow = {k: v for k, v in state.state_dict.items() if not k.startswith("average.")}

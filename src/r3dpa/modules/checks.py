@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from r3dpa.checkpoints import Checkpoint
 from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.geometry import (
     RangeCodec,
@@ -82,3 +83,12 @@ def check_planned_images(planned: ScanGeometry, recorded: Mapping[str, Any], sou
     geometry = ScanGeometry.from_dict(dict(recorded))
     if not isinstance(geometry.projection, RingProjection):
         check_same_images(planned, geometry, source)
+
+
+def check_path(before: Checkpoint, path: str) -> None:
+    """Refuse a checkpoint whose velocities, if it has any, are of another path."""
+    if {"sit", "ema"} & before.networks.keys() and before.interpolant != path:
+        raise ValueError(
+            f"{before.path} was trained on the {before.interpolant} path: set "
+            "--model.init_args.path to it"
+        )
