@@ -1,12 +1,13 @@
 from __future__ import annotations
 
+import shutil
 from importlib.resources import files
 
 import pytest
 import torch
 from torch import nn
 
-from lidarsim import Simulator
+from lidarsim import Simulator, load_sensor
 from r3dpa.data import (
     LabelledPointDataModule,
     PointDataModule,
@@ -32,6 +33,7 @@ LABELLED = RangeCodec("log2", return_channel=True, intensity_channel=True, num_c
 
 def module(root, **settings):
     given = {"sensor": SMALL, "codec": CODEC, "grid_size": (4, 8), "num_scans": 10, "every": 3}
+    given |= {"simulation_sensor": "vlp16"}  # a quarter of the beams of the default
     return SimulatedImageDataModule(str(root), **(given | settings))
 
 
@@ -42,13 +44,26 @@ def root(tmp_path_factory):
     return folder
 
 
+@pytest.fixture(scope="module")
+def labelled_root(tmp_path_factory):
+    """Four labelled images, which no test changes."""
+    folder = tmp_path_factory.mktemp("labelled")
+    module(folder, codec=LABELLED, num_scans=4).prepare_data()
+    return folder
+
+
+def simulated(item):
+    """The scan of a cached image, simulated again."""
+    return Simulator(0, int(item.drive), sensor=load_sensor("vlp16")).scan(item.number)
+
+
 def test_cached_images_are_those_of_the_simulated_scans(root):
     data = module(root)
     data.setup("fit")
     assert (len(data.train_set), len(data.val_set)) == (8, 2)
     index = next(i for i, item in enumerate(data.train_set.scans) if item.number == 3)
     item = data.train_set.scans[index]
-    points = torch.from_numpy(Simulator(0, int(item.drive)).scan(3).points)
+    points = torch.from_numpy(simulated(item).points)
     range_m, _ = range_image(points[:, :3], SphericalProjection(SMALL))
     sample = data.train_set[index]
     found = CODEC.ranges_of(sample["range_image"], SMALL)
@@ -88,12 +103,10 @@ def test_rings_need_points(tmp_path):
         module(tmp_path, projection="rings")
 
 
-def test_intensity_and_class_are_those_of_the_nearest_points(tmp_path):
-    data = module(tmp_path, codec=LABELLED, num_scans=2)
-    data.prepare_data()
+def test_intensity_and_class_are_those_of_the_nearest_points(labelled_root):
+    data = module(labelled_root, codec=LABELLED, num_scans=4)
     data.setup("fit")
-    (item,) = data.train_set.scans
-    scan = Simulator(0, int(item.drive)).scan(item.number)
+    scan = simulated(data.train_set.scans[0])
     points, labels = torch.from_numpy(scan.points), torch.from_numpy(scan.labels.astype("int64"))
     values = torch.stack([points[:, 3], 1.0 + classes_of(labels & 0xFFFF)], dim=1)
     range_m, values = range_image(points[:, :3], SphericalProjection(SMALL), values)
@@ -102,14 +115,15 @@ def test_intensity_and_class_are_those_of_the_nearest_points(tmp_path):
     torch.testing.assert_close(found.intensity, values[0], rtol=0, atol=1e-6)
     assert torch.equal(found.classes, values[1].long() - 1)
     assert len(found.classes.unique()) > 4
-    (row,) = tmp_path.glob("labelled_image_*/shard_00000.rows")
-    assert row.stat().st_size == 2 * 3 * 16 * 64  # two scans, three bytes a pixel
+    (row,) = labelled_root.glob("labelled_image_*/shard_00000.rows")
+    assert row.stat().st_size == 4 * 3 * 16 * 64  # four scans, three bytes a pixel
 
 
-def test_cached_images_and_files_of_the_same_scans_agree(tmp_path):
+def test_cached_images_and_files_of_the_same_scans_agree(labelled_root, tmp_path):
     settings = {"sensor": SMALL, "codec": LABELLED, "grid_size": (4, 8), "num_scans": 2}
+    settings |= {"simulation_sensor": "vlp16"}
     files = SimulatedDataModule(str(tmp_path / "files"), **settings)
-    images = module(tmp_path / "images", codec=LABELLED, num_scans=2, every=1)
+    images = module(labelled_root, codec=LABELLED, num_scans=4)
     samples = []
     for data in (files, images):
         data.prepare_data()
@@ -140,9 +154,9 @@ class _Intensities(nn.Module):
 
 
 def test_grids_of_labelled_images_are_made_of_their_pixels_without_simulating(
-    tmp_path, monkeypatch
+    labelled_root, tmp_path, monkeypatch
 ):
-    module(tmp_path, codec=LABELLED, num_scans=4).prepare_data()
+    shutil.copytree(labelled_root, tmp_path, dirs_exist_ok=True)
     monkeypatch.delattr(Simulator, "scan")
     data = module(tmp_path, codec=LABELLED, num_scans=4, extractor=_Intensities())
     data.prepare_data()
@@ -159,14 +173,15 @@ def test_grids_of_labelled_images_are_made_of_their_pixels_without_simulating(
             torch.testing.assert_close(grid[:, channel], expected, rtol=2e-3, atol=1e-3)
 
 
-def test_grids_of_another_extractor_are_refused(tmp_path):
+def test_grids_of_another_extractor_are_refused(labelled_root, tmp_path):
+    shutil.copytree(labelled_root, tmp_path, dirs_exist_ok=True)
     module(tmp_path, codec=LABELLED, num_scans=4, extractor=_Intensities()).prepare_data()
     (grids,) = (tmp_path / "feature_grids").rglob("*.rows")
     before = grids.read_bytes()
     other = _Intensities()
     other.settings = {"weights": "others"}
     with pytest.raises(StoreError, match="were made with extractor"):
-        module(tmp_path, codec=LABELLED, num_scans=8, extractor=other).prepare_data()
+        module(tmp_path, codec=LABELLED, num_scans=5, extractor=other).prepare_data()
     assert grids.read_bytes() == before
 
 
@@ -175,8 +190,8 @@ def test_ranges_alone_give_no_features(tmp_path):
         module(tmp_path, extractor=_Intensities())
 
 
-def test_points_and_classes_of_a_labelled_image_train_a_network_on_points(tmp_path):
-    source = module(tmp_path, codec=LABELLED, num_scans=2)
+def test_points_and_classes_of_a_labelled_image_train_a_network_on_points(labelled_root):
+    source = module(labelled_root, codec=LABELLED, num_scans=4)
     grid = ScanGrid((-57.6, -57.6, -4.8), (57.6, 57.6, 7.2), 2.4, 0.01, 4)  # keeps all points
     data = LabelledPointDataModule(source, Masking(grid))
     data.prepare_data()
@@ -196,6 +211,7 @@ def test_points_and_classes_of_a_labelled_image_train_a_network_on_points(tmp_pa
 
 def test_points_of_cached_images_lie_along_the_beams_of_a_named_sensor(tmp_path):
     settings = {"sensor": "vlp16", "image_columns": 128, "codec": LABELLED, "num_scans": 2}
+    settings |= {"simulation_sensor": "hdl64e"}
     source = module(tmp_path, **settings, extractor=None)
     source.prepare_data()
     data = PointDataModule(source, lambda points, generator: points)
@@ -207,8 +223,8 @@ def test_points_of_cached_images_lie_along_the_beams_of_a_named_sensor(tmp_path)
     assert (steps - 1).abs().max() < 0.2
 
 
-def test_networks_on_points_need_images_with_intensity(tmp_path):
-    data = LabelledPointDataModule(module(tmp_path, num_scans=2), Masking())
+def test_networks_on_points_need_images_with_intensity(root):
+    data = LabelledPointDataModule(module(root), Masking())
     data.prepare_data()
     with pytest.raises(ValueError, match="intensity_channel to true"):
         data.setup("fit")

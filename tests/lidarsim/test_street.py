@@ -25,7 +25,7 @@ def many_scenes():
     return {
         (drive, scan): Street(0, drive, DRY).scene(scan)
         for drive in range(11)
-        for scan in range(0, 600, 90)
+        for scan in range(0, 600, 200)
     }
 
 
@@ -88,7 +88,7 @@ def test_motion_agrees_with_the_poses(drive):
 def test_the_sensor_is_at_mount_height_above_the_road_and_tilts_with_it():
     for drive in range(4):
         street = Street(3, drive, DRY)
-        for scan in range(0, 400, 37):
+        for scan in range(0, 400, 57):
             scene = street.scene(scan, sensor_height_m=1.8)
             pose = scene.pose
             under = np.array([[pose.x_m, pose.y_m, pose.z_m - 1.8 - 0.3]])
@@ -115,7 +115,7 @@ def test_neighbouring_ground_boxes_meet_without_a_step():
     steps = []
     for drive in range(2):
         course = course_of(0, drive)
-        for block in range(1, 60):
+        for block in range(1, 32):
             for side in (1, -1):
                 # Right at the kerb, where the planes differ most.
                 lateral = side * 0.98 * course.kerb(side).edge_m
@@ -134,7 +134,7 @@ def test_nothing_stands_in_the_lane_of_the_recording_car():
         course = course_of(0, drive)
         at = course.ego_lateral_m + across.ravel()
         up = height.ravel() + [course.surface_m(lateral) for lateral in at]
-        for block in range(12, 60):
+        for block in range(12, 36):
             section = course.section_of(block)
             tunnel = [
                 np.add(section.at((block + ahead) * BLOCK_M, lateral), (0, 0, above))
@@ -204,13 +204,13 @@ def test_walkers_cross_side_streets_on_the_road():
                 height_m, semantic = max(below)
                 assert abs(z - foot.half_size[2] - height_m) < 0.03, (drive, scan)
                 crossing += semantic == Semantic.ROAD
-    assert crossing > 10
+    assert crossing > 4
 
 
 def test_nobody_stands_in_things_and_no_bin_in_others():
     counts = {Semantic.PERSON: 0, Semantic.TRASH_BIN: 0}
     for drive in range(7):
-        for block in range(30):
+        for block in range(12):
             builder = street_module._block(0, drive, block)
             solids = [p for p in (*builder.primitives, *builder.details) if p.instance]
             solids = [p for p in solids if p.material != Material.FOLIAGE]
@@ -243,7 +243,7 @@ def test_cars_park_in_the_direction_of_the_traffic_on_their_side():
 
 def test_no_lane_leads_through_a_traffic_island():
     islands = 0
-    for drive in range(40):
+    for drive in range(24):
         course = course_of(0, drive)
         streams = street_module._streams(0, drive)
         lanes = [s.lateral_m for s in streams if s.kind is street_module.vehicle]
@@ -262,7 +262,7 @@ def test_no_lane_leads_through_a_traffic_island():
                 if p.semantic == Semantic.SIDEWALK and p.half_size[1] < 0.5:
                     assert not inside(p, wheels).any(), (drive, block)
                     islands += 1
-    assert islands > 20
+    assert islands > 12
 
 
 def test_cars_parked_in_side_streets_stand_on_the_road():
