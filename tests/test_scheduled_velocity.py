@@ -76,10 +76,10 @@ def test_tables_of_modulations_give_the_scenes_of_the_plain_network(sampler, pat
 
     The latents are of order 1. bf16 keeps 8 bits, 0.4 % per operation; measured: below 0.04.
     """
-    expected = slow_latents(sampler, 4, 2, path)
-    found = generator(sampler, path=path).generate(range(4), seed=2)
+    expected = slow_latents(sampler, 2, 2, path)
+    found = generator(sampler, path=path).generate(range(2), seed=2)
     torch.testing.assert_close(found.latents, expected, atol=1e-5, rtol=0)
-    half = generator(sampler, "bf16", path=path).generate(range(4), seed=2)
+    half = generator(sampler, "bf16", path=path).generate(range(2), seed=2)
     error = (half.latents - expected).abs().max()
     assert 1e-5 < error < 0.08
     assert half.latents.dtype == half.range_m.dtype == torch.float32

@@ -1,6 +1,7 @@
 """Snapshots of the average: when and what is written, and which may guide which model."""
 
 import hashlib
+import shutil
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -55,15 +56,23 @@ def run(callback, made, folder, steps, **more):
     return sorted(path.name for path in folder.rglob("*.safetensors"))
 
 
-@pytest.fixture
-def pair(tmp_path):
-    """Path of a snapshot, and the checkpoint of the same run at its end."""
-    made = module()
-    run(EMASnapshots(steps=[2]), made, tmp_path, [1, 2], max_steps=-1)
-    path = tmp_path / "snapshots" / "step_0000002.safetensors"
+@pytest.fixture(scope="module")
+def first_pair(tmp_path_factory):
+    """The pair of all tests, whose files no test changes."""
+    folder, made = tmp_path_factory.mktemp("run"), module()
+    run(EMASnapshots(steps=[2]), made, folder, [1, 2], max_steps=-1)
+    path = folder / "snapshots" / "step_0000002.safetensors"
     early = read_checkpoint(path)
     vae = NetworkState.of(made.vae, VAE_ARGS)
-    return path, replace(early, path=tmp_path / "end.ckpt", networks={**early.networks, "vae": vae})
+    return path, replace(early, networks={**early.networks, "vae": vae})
+
+
+@pytest.fixture
+def pair(first_pair, tmp_path):
+    """Path of a snapshot, and the checkpoint of the same run at its end."""
+    path, end = first_pair
+    shutil.copytree(path.parent, tmp_path / "snapshots")
+    return tmp_path / "snapshots" / path.name, replace(end, path=tmp_path / "end.ckpt")
 
 
 def with_norm(checkpoint, mean, variance):

@@ -4,6 +4,7 @@ import math
 import re
 import signal
 from dataclasses import asdict
+from functools import cache
 from types import SimpleNamespace
 
 import lightning as L
@@ -38,6 +39,20 @@ FAULTS = [
 ]
 
 
+def accumulated(module, data, accumulate):
+    """Trains with so many batches a step."""
+    steps = len(data.batches) // accumulate
+    settings = {"accumulate_grad_batches": accumulate, "gradient_clip_val": 1.0}
+    return train(module, data, max_steps=steps, **settings)
+
+
+@cache
+def without_the_middle_step(stage, accumulate):
+    """Run of three steps without the batches of the second one, which several faults share."""
+    data = NamedData(3 * accumulate, range(accumulate, 2 * accumulate))
+    return accumulated(guarded(stage, numbers=data.numbers), data, accumulate)
+
+
 @pytest.mark.numerics
 class TestABadStep:
     @pytest.mark.parametrize(
@@ -51,15 +66,9 @@ class TestABadStep:
 
         With two batches a step the second one of the middle step is broken; both are then lost.
         """
-        num, bad = 3 * accumulate, 2 * accumulate - 1
-        lost = range(accumulate, 2 * accumulate)
-        settings = {"accumulate_grad_batches": accumulate, "gradient_clip_val": 1.0}
-        runs = {}
-        for name, data in (("with", NamedData(num)), ("without", NamedData(num, lost))):
-            module = guarded(stage, [bad], fault, data.numbers)
-            steps = len(data.batches) // accumulate
-            runs[name] = train(module, data, max_steps=steps, **settings)
-        with_it, without = runs["with"], runs["without"]
+        bad = 2 * accumulate - 1
+        with_it = accumulated(guarded(stage, [bad], fault), NamedData(3 * accumulate), accumulate)
+        without = without_the_middle_step(stage, accumulate)
         assert (with_it.guard.skipped, without.guard.skipped) == (1, 0)
         assert with_it.trainer.callback_metrics["train/skipped_steps"] == 1
         assert with_it.global_step == without.global_step + 1 == 3

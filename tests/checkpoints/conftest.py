@@ -1,6 +1,7 @@
 """A checkpoint with every network, as ours and in the official layout."""
 
 import argparse
+import copy
 from pathlib import Path
 
 import pytest
@@ -18,8 +19,9 @@ from r3dpa.checkpoints import (
 )
 
 
-@pytest.fixture
-def checkpoint():
+@pytest.fixture(scope="session")
+def first_checkpoint():
+    """Made once: building the networks takes longer than most of the tests."""
     torch.manual_seed(0)
     networks = {
         name: NetworkState.of(randomised(kind(**args)), args)
@@ -27,6 +29,12 @@ def checkpoint():
     }
     about = {"step": 30, "geometry": GEOMETRY.to_dict(), "feature_source": "geometric"}
     return Checkpoint(Path("run.ckpt"), "joint", networks, **about)
+
+
+@pytest.fixture
+def checkpoint(first_checkpoint):
+    torch.manual_seed(0)
+    return copy.deepcopy(first_checkpoint)
 
 
 @pytest.fixture

@@ -31,12 +31,14 @@ FRID = SceneFeatures("frid", 3, {"in_channels": 4}, features)
 
 
 def scenes(seed, count):
-    """Walls and ground, 64 x 1024 pixels; two drives."""
+    """Walls and ground, 64 x 1024 pixels, with returns in every fourth row; two drives."""
     generator = torch.Generator().manual_seed(seed)
     for index in range(count):
         wall = 5 + 30 * torch.rand(1, 64, generator=generator).repeat_interleave(16, dim=1)
         ground = 3 + 10 * torch.rand(64, 1, generator=generator)
-        yield EvaluationScene(f"{'ab'[index % 2]}/{index:03d}", None, torch.minimum(wall, ground))
+        range_m = torch.full((64, 1024), -1.0)
+        range_m[::4] = torch.minimum(wall, ground)[::4]
+        yield EvaluationScene(f"{'ab'[index % 2]}/{index:03d}", None, range_m)
 
 
 REAL = list(scenes(0, 4))

@@ -162,18 +162,26 @@ def test_voxel_spaces_pool_rings(network_class):
     torch.testing.assert_close(features[2:], expected, **FLOAT32)
 
 
-@pytest.mark.parametrize("name", ["frd", "frid_r2flow", "frid_lidm"])
-def test_range_net_spaces_standardise_their_input_but_for_lidm(name, tmp_path):
+@pytest.fixture(scope="module")
+def range_net(tmp_path_factory):
+    """RangeNet-21 with statistics that no space has, one with the usual ones, file of the first."""
     torch.manual_seed(0)
     network = RangeNet(21, 4, 3, mean=(5.0,) * 4, deviation=(2.0,) * 4)
-    torch.save(network.state_dict(), tmp_path / "weights.pt")
-    space, scene = scene_features(name, tmp_path / "weights.pt", CENTRE), seen(1)[0]
+    file = tmp_path_factory.mktemp("range_net") / "weights.pt"
+    torch.save(network.state_dict(), file)
+    return network, RangeNet(21, 4, 0), file
+
+
+@pytest.mark.parametrize("name", ["frd", "frid_r2flow", "frid_lidm"])
+def test_range_net_spaces_standardise_their_input_but_for_lidm(name, range_net):
+    network, usual, file = range_net
+    space, scene = scene_features(name, file, CENTRE), seen(1)[0]
     range_m = scene.range_m[None]
     if name == "frid_lidm":
         channels = range_channels(range_m, SENSOR)
     else:
         xyz = unproject(range_m, CENTRE.projection).movedim(-1, 1)
-        channels = RangeNet(21, 4, 0).normalise(torch.cat([range_m[:, None], xyz], dim=1))
+        channels = usual.normalise(torch.cat([range_m[:, None], xyz], dim=1))
         assert space.card["mean"] == pytest.approx([12.12, 10.88, 0.23, -1.04])
     expected = network.feature_map(channels)
     expected = picked(expected) if name == "frd" else expected.unflatten(2, (16, -1)).mean((3, 4))
