@@ -121,10 +121,10 @@ def smoke_args(smoke_root):
 
 @pytest.fixture(scope="session")
 def trained_once(smoke_args, make_once):
-    """``trained_once(stage, *more)``: last checkpoint of a stage at smoke size."""
+    """``trained_once(stage, *more)``: last checkpoint of a stage at smoke size, with log."""
 
     def checkpoint(stage: str, *more: str) -> Path:
-        words = ["--trainer.logger=false", *more]
+        words = [f"--trainer.logger={json.dumps([CSV_LOGGER])}", *more]
         run_dir = make_once(stage, lambda folder: main(smoke_args(stage, folder, *words)))
         return run_dir / "checkpoints" / "last.ckpt"
 
@@ -134,23 +134,30 @@ def trained_once(smoke_args, make_once):
 @pytest.fixture(scope="session")
 def vae_checkpoint(trained_once) -> Path:
     """Checkpoint of the VAE-alignment stage at smoke size, trained for three steps."""
-    return trained_once("vae_alignment", "--trainer.limit_val_batches=0", "--trainer.callbacks=[]")
+    return trained_once("vae_alignment")
 
 
 @pytest.fixture(scope="session")
 def flow_checkpoint(trained_once, vae_checkpoint) -> Path:
     """Checkpoint of the flow-matching stage at smoke size, trained for three steps."""
-    more = ["--trainer.limit_val_batches=0", "--trainer.callbacks=[]"]
-    return trained_once("flow_matching", *more, "--model.init_args.init_from", str(vae_checkpoint))
+    return trained_once("flow_matching", "--model.init_args.init_from", str(vae_checkpoint))
 
 
 @pytest.fixture(scope="session")
 def joint_run(smoke_args, vae_checkpoint, make_once):
-    """Run of the joint stage whose last and averaged weights have moved apart."""
-    more = [f"--trainer.logger={json.dumps([CSV_LOGGER])}", "--trainer.limit_val_batches=0"]
-    more += ["--model.init_args.optimizer.lr=1e-2", "--model.init_args.ema_decay=0.5"]
-    more += ["--model.init_args.init_from", str(vae_checkpoint), "--trainer.callbacks=[]"]
-    return make_once("joint", lambda run_dir: main(smoke_args("joint", run_dir, *more)))
+    """Run of the joint stage, with W&B, whose last and averaged weights have moved apart."""
+    more = ["--model.init_args.optimizer.lr=1e-2", "--model.init_args.ema_decay=0.5"]
+    more += ["--model.init_args.init_from", str(vae_checkpoint)]
+
+    def make(run_dir: Path) -> None:
+        import wandb
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("WANDB_MODE", "offline")
+            main(smoke_args("joint", run_dir, *more))
+        wandb.finish()  # or the next logger of this process would join the run
+
+    return make_once("joint", make)
 
 
 @pytest.fixture

@@ -6,6 +6,7 @@ tiny, and so is the UNet.
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -64,13 +65,39 @@ def starts(stage):
     return [name for name in ("init_from", "rgb_weights") if given.get(name) is not None]
 
 
-def tiny_module(stage):
+def tiny_networks_of(stage):
+    """What :func:`changes` trains in place of the networks of a stage."""
     model = stage.config["model"]
     kind = {"VAEAlignment": "vae_alignment", "JointAlignment": "joint"}
     name = kind.get(model["class_path"].rpartition(".")[2], "flow_matching")
-    weights = LossWeights(**model["init_args"].get("weights", {}))
+    given = model["init_args"].get("weights", {})
+    weights = LossWeights(**{k: tuple(v) if isinstance(v, list) else v for k, v in given.items()})
     is_unet = model["init_args"]["sit"]["class_path"].endswith("UNet")
-    return stage_module(name, tiny_unet if is_unet else tiny_sit, weights=weights)
+    return name, tiny_unet if is_unet else tiny_sit, weights
+
+
+@cache
+def changes(name, sit, weights):
+    """Names of the parameters that move in a step, and of those that an alignment loss reaches.
+
+    Several rows share a stage.
+    """
+    module = stage_module(name, sit, weights=weights)
+    module.separates_losses = True
+    before = {name: value.clone() for name, value in module.named_parameters()}
+    train(module)
+    moved = {
+        name
+        for name, value in module.named_parameters()
+        if not torch.equal(value, before[name]) and not name.startswith("ema.")
+    }
+    reached = {
+        name.split(".")[0]
+        for part, found in module.reached[0].items()
+        if part.endswith("_alignment")
+        for name in found
+    }
+    return moved, reached
 
 
 def test_every_row_of_the_tables_is_tested_here(rows):
@@ -91,21 +118,7 @@ def test_a_row_starts_from_its_weights(row, rows):
 @pytest.mark.parametrize("row", EXPECTED, ids="/".join)
 def test_a_row_trains_and_aligns_its_networks(row, rows):
     for stage, (trained, aligned) in zip(rows[row], EXPECTED[row], strict=True):
-        module = tiny_module(stage)
-        module.separates_losses = True
-        before = {name: value.clone() for name, value in module.named_parameters()}
-        train(module)
-        moved = {
-            name
-            for name, value in module.named_parameters()
-            if not torch.equal(value, before[name]) and not name.startswith("ema.")
-        }
+        moved, reached = changes(*tiny_networks_of(stage))
         parts = {name if name in trained else name.split(".")[0] for name in map(group_of, moved)}
         assert parts == trained, stage.name
-        reached = {
-            name.split(".")[0]
-            for part, found in module.reached[0].items()
-            if part.endswith("_alignment")
-            for name in found
-        }
         assert reached == aligned, stage.name
