@@ -60,6 +60,7 @@ def test_an_object_is_judged_by_class_and_by_size(low, high, matches, expected):
     assert judge(points, torch.full((len(points),), matches), CENTRE, CAR, 3.0) == expected
 
 
+@pytest.mark.slow
 def test_the_figures_of_a_tiny_model_are_written(tmp_path):
     torch.manual_seed(0)
     ckpt = labelled_checkpoint(tmp_path)
@@ -77,6 +78,7 @@ def test_the_figures_of_a_tiny_model_are_written(tmp_path):
     codec = {"return_channel": True, "intensity_channel": True, "num_classes": NUM_CLASSES}
     data["init_args"] = {"root": str(tmp_path / "images"), "num_scans": 10, "grid_size": [2, 8]}
     data["init_args"] |= {"sensor": {"beams": 16, "columns": 64}, "codec": codec}
+    data["init_args"] |= {"simulation_sensor": "hdl32e"}
     (tmp_path / "data.yaml").write_text(yaml.safe_dump({"data": data}))
     words = ["--ckpt", ckpt, "--objects", tmp_path / "lib.objects", "--teacher", weights]
     words += ["--data", tmp_path / "data.yaml", "--num", 2, "--classes", "car", "--steps", 2]

@@ -9,18 +9,18 @@ from r3dpa.data import LidarDataModule
 from r3dpa.geometry import LidarSensor, SphericalProjection, points_of
 from r3dpa.metrics.scene import PUBLISHED
 
-SENSOR = LidarSensor(beams=16, columns=64)
+SENSOR = LidarSensor(beams=16, columns=32)
 
 
 def test_each_choice_shifts_what_it_changes(tmp_path, monkeypatch):
     """Samples are the real scans with a wall at 60 m, which only wider range cuts see."""
-    coarse = {"published": replace(PUBLISHED, voxel_m=0.5)}
+    coarse = {"published": replace(PUBLISHED, voxel_m=0.5, num_mmd_samples=2)}
     monkeypatch.setattr(protocol_shifts, "PROTOCOLS", coarse)
     projection = SphericalProjection(SENSOR)
     generator = torch.Generator().manual_seed(0)
     for index in range(8):
-        image = 4 + 20 * torch.rand(1, 64, generator=generator).expand(16, 64).clone()
-        image += torch.rand(16, 64, generator=generator)
+        image = 4 + 20 * torch.rand(1, 32, generator=generator).expand(16, 32).clone()
+        image += torch.rand(16, 32, generator=generator)
         for folder, wall_m in ((f"real/{'ab'[index % 2]}", -1.0), ("samples", 60.0)):
             image[0] = wall_m
             write_bin(tmp_path / folder / f"{index}.bin", points_of(image, projection))

@@ -48,10 +48,10 @@ def test_held_out_and_real_scans_are_measured(tmp_path):
     )
     data = {"class_path": "r3dpa.data.SimulatedImageDataModule"}
     data["init_args"] = {"root": str(tmp_path / "images"), "num_scans": 2, "grid_size": [4, 8]}
-    data["init_args"] |= {"sensor": {"beams": 16, "columns": 64}}
+    data["init_args"] |= {"sensor": {"beams": 16, "columns": 64}, "simulation_sensor": "vlp16"}
     data["init_args"] |= {"codec": {"return_channel": True, "intensity_channel": True}}
     (tmp_path / "data.yaml").write_text(yaml.safe_dump({"data": data}))
-    simulate(tmp_path / "real", 1)
+    simulate(tmp_path / "real", 1, sensor="vlp16")
     out = tmp_path / "quality.json"
     words = ["--ckpt", weights, "--data", tmp_path / "data.yaml", "--real", tmp_path / "real"]
     main([str(word) for word in (*words, "--out", out)])
