@@ -17,7 +17,7 @@ from r3dpa.metrics.results import EvaluationTable, MetricResult
 from r3dpa.metrics.scene import DEFAULT, EvaluationScene, through_sensor
 from r3dpa.metrics.scene_features import SceneFeatures
 
-SENSOR = LidarSensor(beams=16, columns=64)
+SENSOR = LidarSensor(beams=16, columns=32)
 PROTOCOL = replace(DEFAULT, sensor=SENSOR, voxel_m=2.0, num_samples=60)
 CARD = {"backbone": "toy", "layer": "all", "weights": "abc", "preprocessing": "none"}
 QUICK = Resampling(num_resamples=40)
@@ -39,11 +39,11 @@ def scenes(seed=0, count=40, noise=0.0):
     generator, noise_generator = (torch.Generator().manual_seed(s) for s in (seed, 1000 + seed))
     for i in range(count):
         width, ground = 4 + 6 * torch.rand(2, generator=generator)
-        columns = width / (0.2 + torch.linspace(-3, 3, 64).sin().abs())
-        range_m = columns.clamp(max=50).expand(16, 64) + ground * torch.rand(
+        columns = width / (0.2 + torch.linspace(-3, 3, 32).sin().abs())
+        range_m = columns.clamp(max=50).expand(16, 32) + ground * torch.rand(
             16, 1, generator=generator
         )
-        range_m = range_m + noise * torch.randn(16, 64, generator=noise_generator).abs()
+        range_m = range_m + noise * torch.randn(16, 32, generator=noise_generator).abs()
         yield EvaluationScene(f"drive{i % 2}/{i:03d}", None, range_m)
 
 
@@ -75,10 +75,9 @@ def large_reference(num_scans):
 
 
 @cache
-def found(seed, count=40, noise=0.0, num_resamples=40):
+def found(seed, count=40):
     """Rows of these scenes against the reference of the module, computed once."""
-    resampling = Resampling(num_resamples=num_resamples)
-    return rows_of(scenes(seed, count, noise), whole_reference(), resampling=resampling)
+    return rows_of(scenes(seed, count), whole_reference())
 
 
 @cache
@@ -137,7 +136,12 @@ def test_floors_are_between_the_drives():
 
 def test_intervals_are_as_wide_as_fresh_sets_differ():
     """Half a 95 % interval is two standard deviations; both are estimates from few."""
-    sets = [found(1, noise=1.0), *(found(seed, noise=1.0, num_resamples=0) for seed in range(2, 8))]
+    # Matching is slow and not compared here.
+    reference = reference_of(list(scenes()), replace(PROTOCOL, num_mmd_samples=4))
+    sets = [
+        rows_of(scenes(seed, noise=1.0), reference, resampling=Resampling(num_resamples=num))
+        for seed, num in zip(range(1, 8), (40, *[0] * 6), strict=True)
+    ]
     for name in ("W1 range", "TOY", "JSD"):
         spread = torch.tensor([rows[name].value for rows in sets]).std().item()
         ratio = sets[0][name].half_width / (2 * spread)
@@ -177,8 +181,8 @@ BAD = [
     (EvaluationScene("bad/2", torch.full((1, 3), math.nan)), "bad/2: cloud holds 3 NaN"),
     (EvaluationScene("bad/3", None, torch.ones(8, 8)), r"bad/3: range image of shape \(8, 8\)"),
     (EvaluationScene("bad/4", torch.tensor([[0.0, 52.0, 0.0]])), "bad/4: none of 1 points has"),
-    (EvaluationScene("bad/5", None, torch.full((16, 64), -1.0)), "bad/5: no pixel of the range"),
-    (EvaluationScene("bad/6", None, torch.full((16, 64), math.nan)), "bad/6: range image holds"),
+    (EvaluationScene("bad/5", None, torch.full((16, 32), -1.0)), "bad/5: no pixel of the range"),
+    (EvaluationScene("bad/6", None, torch.full((16, 32), math.nan)), "bad/6: range image holds"),
     (EvaluationScene("bad/7", None), "bad/7: has neither points nor"),
     (EvaluationScene("bad/8", torch.ones(2, 5)), r"bad/8: points of shape \(2, 5\)"),
 ]
@@ -247,7 +251,7 @@ def test_floors_of_few_scenes_are_not_kept_for_more():
 
 def test_verdict_is_one_line_above_the_table():
     large = large_reference(64)
-    near = evaluated(scenes(1), large).about["extra"]["verdict"]
+    near = evaluated(scenes(1, 32), large).about["extra"]["verdict"]  # the least that tell
     assert near.startswith("near the floor in JSD")
     noisy = evaluated(scenes(1, noise=12.0), large)
     line = noisy.about["extra"]["verdict"]
@@ -261,7 +265,6 @@ def test_verdict_is_one_line_above_the_table():
     [
         (4, 64, "too few to tell: 4 scenes, floors between 4 scans; give at least 32 scenes"),
         (32, 62, "too few to tell: 32 scenes, floors between 31 scans"),
-        (32, 64, "near the floor in"),
     ],
 )
 def test_verdict_needs_enough_scenes_and_scans(num_scenes, num_scans, start):
@@ -302,8 +305,8 @@ def test_scenes_of_another_sensor_are_warned_of(reference):
         scene.range_m[1::2] = -1
         scene.range_m[:, 1::2] = -1
     told = evaluated(coarse, reference)
-    assert told.about["extra"]["warning"].startswith("256 returns in a scene (median), but 1,024")
-    assert "warning: 256 returns" in str(told)
+    assert told.about["extra"]["warning"].startswith("128 returns in a scene (median), but 512")
+    assert "warning: 128 returns" in str(told)
     assert "warning" not in str(fresh())
 
 
@@ -311,19 +314,19 @@ def corrupted(scene, ladder, amount):
     """The scan with noise on its ranges, or without a share of them; smaller amounts nest."""
     generator = torch.Generator().manual_seed(int(scene.name.rpartition("/")[2]))
     if ladder == "noise":
-        noise = amount * torch.randn(16, 64, generator=generator).abs()
+        noise = amount * torch.randn(16, 32, generator=generator).abs()
         return scene._replace(range_m=scene.range_m + noise)
-    dropped = torch.rand(16, 64, generator=generator) < amount
+    dropped = torch.rand(16, 32, generator=generator) < amount
     return scene._replace(range_m=torch.where(dropped, -1.0, scene.range_m))
 
 
 @pytest.mark.parametrize(
     ("ladder", "amounts", "blind"),
-    [("noise", (0.0, 1.5, 4.0, 12.0), ()), ("drop", (0.0, 0.3, 0.6, 0.9), ("W1 range",))],
+    [("noise", (1.5, 4.0, 12.0), ()), ("drop", (0.3, 0.6, 0.9), ("W1 range",))],
 )
 def test_every_distance_worsens_with_each_corruption(reference, ladder, amounts, blind):
     """What is dropped at random leaves the distribution of ranges as it is."""
-    steps = [
+    steps = [found(1, 20)] + [
         rows_of([corrupted(s, ladder, amount) for s in scenes(1, 20)], reference)
         for amount in amounts
     ]
