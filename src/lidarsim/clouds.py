@@ -62,7 +62,7 @@ class CloudFile(NamedTuple):
 
     path: Path
     kind: str  # format in words
-    pack: Callable[[Table], bytes]  # content of the file for other rows
+    pack: Callable[[Table], bytes] | None  # content for other rows; None for other columns
     data: bytes | None = None  # content for the rows of the cloud, if known
     label_path: Path | None = None
 
@@ -105,7 +105,7 @@ class PointCloud:
         named = dict(zip(ROWS, rows.T, strict=False))
         named |= {name: np.asarray(column) for name, column in columns.items()}
         table = table_of(named, len(rows))
-        return cls(table, _known_columns("the cloud", table), labels)
+        return cls(table, known_columns("the cloud", table), labels)
 
     def __len__(self) -> int:
         return len(self.table)
@@ -185,7 +185,11 @@ class PointCloud:
         """Cloud with another column ``(P,)``, or one column more."""
         columns = {known: self.table[known] for known in self.table.dtype.names or ()}
         table = table_of(columns | {name: values}, len(self))
-        return replace(self, table=table, names=_known_columns(self.where, table))
+        file = self.file
+        if file is not None:
+            pack = file.pack if table.dtype == self.table.dtype else None
+            file = file._replace(pack=pack, data=None)
+        return replace(self, table=table, names=known_columns(self.where, table), file=file)
 
     def changed(
         self,
@@ -323,7 +327,7 @@ def read_cloud(
     except UNPICKLING_ERRORS as error:
         reason = f"is damaged or of another layout ({first_line(error)})"
         raise ScanError(f"{path}: {reason}") from error
-    names = _known_columns(path, table)
+    names = known_columns(path, table)
     labels, label_path = _labels(path, len(table)) if with_labels else (None, None)
     is_finite = np.all([np.isfinite(table[name]) for name in names.values()], axis=0)
     if is_finite.all():
@@ -353,7 +357,7 @@ def write_cloud(path: str | Path, cloud: PointCloud) -> None:
 def packed(path: Path, cloud: PointCloud) -> bytes:
     """Return the content of a file of a cloud, see :func:`write_cloud`."""
     suffix, file = suffix_of(path), cloud.file
-    if file is not None and suffix_of(file.path) == suffix:
+    if file is not None and file.pack is not None and suffix_of(file.path) == suffix:
         return file.pack(cloud.table) if file.data is None else file.data
     if suffix not in WRITERS:
         raise ScanError(f"{path}: cannot be written; choose from {', '.join(WRITERS)}")
@@ -411,7 +415,10 @@ def _las_of(cloud: PointCloud, full_scale: float | None, suffix: str = ".las") -
     if "intensity" in columns:
         shares = cloud.intensity_shares(full_scale).clip(0, 1)
         columns["intensity"] = np.rint(shares * _LAS_FULL_INTENSITY).astype(np.uint16)
-    return clouds_las.las_of(columns, suffix)
+    try:
+        return clouds_las.las_of(columns, suffix)
+    except ValueError as error:
+        raise ScanError(f"{cloud.where}: {error}") from error
 
 
 #: Formats that can be written from any other, by suffix.
@@ -478,7 +485,7 @@ def _labels(path: Path, num_points: int) -> tuple[NDArray[np.uint32] | None, Pat
     return np.frombuffer(data, "<u4"), place
 
 
-def _known_columns(where: str | Path, table: Table) -> dict[str, str]:
+def known_columns(where: str | Path, table: Table) -> dict[str, str]:
     """Return the names of the columns that are understood."""
     names = {name.lower(): name for name in table.dtype.names or ()}
     known: dict[str, str] = {}

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from lidarsim.cloud_formats import ScanError, Table
-from lidarsim.clouds import PointCloud, suffix_of
+from lidarsim.cloud_formats import ScanError, Table, table_of
+from lidarsim.clouds import PointCloud, known_columns, suffix_of
 
 #: Suffixes of bags.
 BAGS = (".bag", ".db3", ".mcap")
@@ -73,12 +73,11 @@ def _cloud_of(path: Path, number: int, message: Any) -> PointCloud:
     """Point cloud of a message."""
     try:
         table = _table_of(message)
-        points = np.stack([table[axis] for axis in "xyz"], axis=1)
     except (KeyError, TypeError, ValueError) as error:
-        raise ScanError(f"{path}: scan {number} is damaged or lacks x, y, z ({error})") from error
-    finite = np.isfinite(points).all(axis=1)
-    names = [name for name in table.dtype.names or () if name not in {*"xyz"}]
-    return PointCloud.of(points[finite], **{name: table[name][finite] for name in names})
+        raise ScanError(f"{path}: scan {number} is damaged ({error})") from error
+    names = known_columns(f"{path}: scan {number}", table)
+    is_finite = np.all([np.isfinite(table[name]) for name in names.values()], axis=0)
+    return PointCloud(table[is_finite], names)
 
 
 def _table_of(message: Any) -> Table:
@@ -95,4 +94,5 @@ def _table_of(message: Any) -> Table:
     )
     lines = np.asarray(message.data, np.uint8).reshape(message.height, message.row_step)
     used = np.ascontiguousarray(lines[:, : message.width * message.point_step])
-    return used.view(dtype).reshape(-1)
+    table = used.view(dtype).reshape(-1)
+    return table_of({name: table[name] for name in dtype.names or ()}, len(table))

@@ -45,20 +45,29 @@ def las_of(columns: Mapping[str, NDArray], suffix: str) -> bytes:
     header.offsets = np.floor([columns[axis].min() for axis in "xyz"])
     known = {*"xyz", *header.point_format.dimension_names}
     named = {_OWN.get(name, name): column for name, column in columns.items()}
-    header.add_extra_dims(
-        [
-            laspy.ExtraBytesParams(name, column.dtype.newbyteorder("="))
-            for name, column in named.items()
-            if name not in known
-        ]
-    )
+    for name, column in named.items():
+        if name not in known:
+            try:
+                dtype = column.dtype.newbyteorder("=")
+                header.add_extra_dims([laspy.ExtraBytesParams(name, dtype)])
+            except (laspy.LaspyException, ValueError) as error:
+                raise ValueError(_no_place(name, column)) from error
     return _written(header, named, suffix)
 
 
 def _written(header: laspy.LasHeader, columns: Mapping[str, NDArray], suffix: str) -> bytes:
     las = laspy.LasData(header, laspy.ScaleAwarePointRecord.zeros(len(columns["x"]), header=header))
     for name, column in columns.items():
-        las[name] = column
+        try:
+            las[name] = column
+        except OverflowError as error:
+            raise ValueError(_no_place(name, column)) from error
+        if name not in "xyz" and not np.allclose(las[name], column, equal_nan=True):
+            raise ValueError(_no_place(name, column))
     stream = io.BytesIO()
     las.write(stream, do_compress=suffix == ".laz")
     return stream.getvalue()
+
+
+def _no_place(name: str, column: NDArray) -> str:
+    return f"column {name!r} of {column.dtype} does not fit into .las: rename or drop it"

@@ -54,6 +54,8 @@ def convert(
     if suffix not in WRITERS:
         choices = ", ".join(name.removeprefix(".") for name in WRITERS)
         raise ValueError(f"{out}: unknown format {suffix!r}; choose --to from {choices}")
+    if full_intensity is not None and not 0 < full_intensity < np.inf:
+        raise ValueError(f"full_intensity must be positive, got {full_intensity:g}")
     if is_bag(source):
         if columns:
             raise ValueError(f"{source}: the scans of a bag have names for their columns")

@@ -148,6 +148,7 @@ class Fault:
 
     def _beams(self, scan: RecordedScan, generator: np.random.Generator) -> NDArray[np.bool_]:
         rings = rings_of(scan)
+        is_empty = ~scan.points.any(axis=1)  # shots without a return have no beam
         if rings.sure < _LEAST_SURE or rings.num_rings < 2:
             raise ValueError(
                 f"{self.kind} needs the beam of each point, but only {rings.sure:.0%} of the "
@@ -157,10 +158,12 @@ class Fault:
         number = np.arange(rings.num_rings)
         kept = round((1 - self.amount) * rings.num_rings)
         if self.kind == "missing_beams":
-            return (generator.permutation(number) < kept)[rings.ring]
+            return is_empty | (generator.permutation(number) < kept)[rings.ring]
         chosen = (number + 1) * kept // rings.num_rings > number * kept // rings.num_rings
         stays = chosen[rings.ring]
-        return stays & (rings.shot % 2 == 0) if self._halves_shots else stays
+        if self._halves_shots:
+            stays &= rings.shot % 2 == 0
+        return is_empty | stays
 
     def _echoes(self, scan: RecordedScan, generator: np.random.Generator) -> NDArray[np.bool_]:
         if scan.labels is None:

@@ -61,8 +61,15 @@ def rings_of(scan: RecordedScan) -> Rings:
         shuffled HDL-64E scan are not.
 
     Rings are numbered by their mean inclination. The number of shots follows from the median step
-    of azimuth within the rings.
+    of azimuth within the rings. Points at (0, 0, 0), which are no returns, have ring and shot 0.
     """
+    is_return = scan.points.any(axis=1)
+    if not is_return.all() and is_return.any():
+        ring_column = None if scan.ring is None else scan.ring[is_return]
+        rings = rings_of(RecordedScan(scan.points[is_return], ring=ring_column))
+        ring, shot = np.zeros((2, len(scan)), np.int64)
+        ring[is_return], shot[is_return] = rings.ring, rings.shot
+        return rings._replace(ring=ring, shot=shot)
     inclination, azimuth = angles_of(scan.points)
     azimuth %= 2 * np.pi
     if scan.ring is None:
@@ -92,7 +99,10 @@ def _in_order(
 ) -> tuple[NDArray[np.int64], How, float] | None:
     """Rings of a file that holds ring after ring, in either direction; None for another order."""
     low, high = np.degrees(np.quantile(inclination, [0.001, 0.999]))
-    limits = {"inclination_min_deg": low - 0.5, "inclination_max_deg": high + 0.5}
+    limits = {
+        "inclination_min_deg": max(low - 0.5, -90.0),
+        "inclination_max_deg": min(high + 0.5, 90.0),
+    }
     sensor = LidarSensor(_MOST_BEAMS // 2, **limits)
     for turned in (azimuth, -azimuth % (2 * np.pi)):
         with suppress(ValueError):

@@ -87,10 +87,17 @@ def read_clouds(path: str | Path, columns: Sequence[str] = ()) -> dict[str, np.n
     if is_one_cloud(path):
         return {path.stem: read_points(path, columns)}
     clouds = read_npz(path)
+    if len(clouds) == 1:
+        return {name: read_points(path, columns) for name in clouds}
     for name, points in clouds.items():
         if points.ndim != 2 or points.shape[1] not in (3, 4):
             raise ScanError(
                 f"{path}: {name} must be points (P, 3) or (P, 4), got shape {points.shape}"
+            )
+        if num_bad := np.count_nonzero(~np.isfinite(points).all(axis=1)):
+            raise ScanError(
+                f"{path}: {name} has NaN or infinite values in {num_bad} of {len(points)} points: "
+                "drop these points first"
             )
     if not clouds:
         raise ScanError(f"{path}: holds no scan")

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarsim import scan_structure as structure
+from lidarsim.cloud_formats import ODD_SHARE
 from lidarsim.scan_structure import GROUND_BAND_M, Floats, Ground, Indices, Mask, RingReturns
 from lidarsim.sensors.view import LidarSensor, hit_pixels
 
@@ -136,11 +137,13 @@ def scan_statistics(points: NDArray[np.float32]) -> ScanStatistics:
     seen = (distance > _RANGES_M[0]) & (distance < _RANGES_M[1])
     xyz, range_m = points[seen, :3].astype(np.float64), distance[seen]
     intensity = points[seen, 3]
-    if len(intensity) and not (intensity.min() >= 0 and intensity.max() <= 1):
+    is_odd = ~((intensity >= 0) & (intensity <= 1))
+    if np.count_nonzero(is_odd) > ODD_SHARE * len(intensity):
         raise ValueError(
             f"intensity must lie in [0, 1], got {intensity.min():g} to {intensity.max():g}; "
             "divide by the largest value that the sensor can give"
         )
+    intensity = intensity.clip(0, 1)
     s = ScanStatistics(num_scans=1, num_returns=float(len(xyz)))
     s.low_points = float((xyz[:, 2] < _LOW_Z_M).sum())
     valid_mask = hit_pixels(points[:, :3], SENSOR)

@@ -51,7 +51,15 @@ def test_velocity_is_that_of_the_interpolant(path):
 
 
 @pytest.mark.parametrize(
-    ("solver", "steps"), [("heun", 60), ("ab3", 100), ("euler_maruyama", 150), ("ddpm", 150)]
+    ("solver", "steps"),
+    [
+        ("heun", 60),
+        ("ab3", 100),
+        ("euler_maruyama", 150),
+        ("ddpm", 150),
+        ("dpmpp_2m", 20),  # the last step, to the end of the path, is of first order
+        ("unipc", 20),
+    ],
 )
 def test_solvers_reach_the_spread_of_gaussian_data(solver, steps):
     """Data N(0, 0.25): the expected data is ``alpha / (alpha^2 + 4 sigma^2) x``."""

@@ -342,6 +342,11 @@ class TestView:
         assert [row[:2] for row in page["categories"]["semantic"]] == [[int(Semantic.CAR), "car"]]
         assert [row[:2] for row in page["categories"]["origin"]] == [[int(Origin.RAIN), "rain"]]
 
+    def test_a_file_of_several_scans_in_a_folder_is_named(self, tmp_path):
+        np.savez(tmp_path / "two.npz", a=points(), b=points())
+        with pytest.raises(ScanError, match=r"two\.npz: holds 2 scans: give the file alone"):
+            view(tmp_path, out=tmp_path / "out")
+
     def test_labels_of_semantic_kitti_are_shown(self, tmp_path):
         write_bin(tmp_path / "velodyne" / "0.bin", points())
         (tmp_path / "labels").mkdir()
@@ -391,7 +396,7 @@ class TestView:
             ("notes.txt", r"notes.txt: is of no known format; can be read: .bin, "),
             ("absent", "no scan found"),
             ("damaged.npz", r"damaged\.npz: is damaged or no \.npz file"),
-            ("counts.npz", r"counts must be points .*, got shape \(3,\)"),
+            ("counts.npz", r"counts\.npz: holds float64 of shape \(3,\), not rows"),
             ("empty.npz", r"empty\.npz: holds no scan"),
         ):
             with pytest.raises(ValueError, match=message):

@@ -292,6 +292,7 @@ def test_a_scan_without_a_point_left_is_not_written(folder, tmp_path):
 
 BAD = {
     "none": ([], "give an option such as --weather.visibility_m 60 or --weather.rain_mm_h 10"),
+    "idle": (["--effects.range_noise", "on"], "no weather is given, so that scans would stay"),
     "none on": (["--effects.range_noise", "off"], "no weather is given, so that scans would stay"),
     "visibility": (["--weather.visibility_m", "0"], "visibility_m must be 1 or greater"),
     "negative": (["--weather.visibility_m", "-5"], "visibility_m must be 1 or greater"),

@@ -27,6 +27,10 @@ def draw(points, seed=0, **options):
     return Masking(GRID, **options)(points, np.random.default_rng(seed))
 
 
+def test_a_scan_out_of_view_has_nothing_to_hide(points):
+    assert draw(points + 100).hidden.shape == (0,)
+
+
 def test_surroundings_by_hand(points):
     scan = prepare_scan(points, GRID)
     targets = Masking(GRID).describe(points, scan)

@@ -53,6 +53,13 @@ def test_rows_that_no_beam_met_are_filled_but_not_single_losses():
     torch.testing.assert_close(range_m, whole, rtol=0.01, atol=0)
 
 
+def test_filled_rows_have_the_values_beside_them():
+    range_m, labels = torch.full((1, 64, 1024), 10.0), torch.full((1, 64, 1024), 7)
+    range_m[:, 5:60:6], labels[:, 5:60:6] = -1, 0
+    seen, view = view_of(range_m, MODEL, projection_for("hdl64e", MODEL))
+    assert (values_in(labels, view, seen)[seen > 0] == 7).all()
+
+
 def test_values_come_from_the_nearest_pixel():
     target = projection_for(some_beams(4), MODEL)
     image = ground(MODEL)

@@ -6,6 +6,19 @@ from lidarsim import Material, Primitive, Semantic, Shape, Sweep
 from lidarsim.draws import Draws
 
 
+def organised_turn(beams=8, shots=500, low_deg=-14.0, high_deg=14.0):
+    """Points ``(beams, shots, 3)`` of a wavy wall 9 to 11 m away."""
+    inclination = np.radians(np.linspace(high_deg, low_deg, beams))[:, None]
+    azimuth = 2 * np.pi * np.arange(shots) / shots
+    directions = [
+        np.cos(inclination) * np.cos(azimuth),
+        np.cos(inclination) * np.sin(azimuth),
+        np.sin(inclination) * np.ones(shots),
+    ]
+    range_m = 10 + np.sin(5 * azimuth)
+    return (range_m[:, None] * np.stack(directions, axis=-1)).astype(np.float32)
+
+
 def box(centre, half_size, **values):
     """A painted wall of reflectivity 0.5, but for what is given."""
     wall = {"semantic": Semantic.WALL, "reflectivity": 0.5, "material": Material.PAINT}

@@ -14,7 +14,7 @@ from numpy.lib.recfunctions import unstructured_to_structured
 from lidarsim.changed_scans import write_below
 from lidarsim.clouds import PointCloud, find_files, read_cloud, write_cloud
 from lidarsim.faults import STRENGTHS, Fault
-from lidarsim.scan_files import ScanError
+from lidarsim.scan_files import ScanError, read_clouds
 from lidarsim.weather import Weather, changed_cloud, recorded_scan
 
 random = np.random.default_rng(0)
@@ -206,6 +206,25 @@ def test_an_organised_array_is_points_with_their_beam(tmp_path):
         np.testing.assert_array_equal(again.ring, cloud.ring[::2])
     with np.load(tmp_path / "half_a.npz") as arrays:
         assert arrays["pose"].tolist() == np.eye(4).tolist()
+
+
+@pytest.mark.parametrize("suffix", ["bin", "npz", "ply"])
+def test_a_changed_column_is_written(tmp_path, suffix):
+    write_cloud(tmp_path / f"a.{suffix}", PointCloud.of(POINTS))
+    cloud = read_cloud(tmp_path / f"a.{suffix}")
+    halves = np.full(NUM, 0.5, np.float32)
+    write_cloud(tmp_path / f"b.{suffix}", cloud.with_column("intensity", halves))
+    assert (read_cloud(tmp_path / f"b.{suffix}").intensity == 0.5).all()
+
+
+def test_arrays_of_npz_are_read_as_other_files_are(tmp_path):
+    """One array may be organised; a file of several scans has no NaN either."""
+    np.savez(tmp_path / "one.npz", POINTS.reshape(4, -1, 3))
+    (points,) = read_clouds(tmp_path / "one.npz").values()
+    np.testing.assert_array_equal(points, POINTS)
+    np.savez(tmp_path / "two.npz", a=POINTS, b=NAN[:, :3])
+    with pytest.raises(ScanError, match=r"two\.npz: b has NaN or infinite values in 1 of 40"):
+        read_clouds(tmp_path / "two.npz")
 
 
 def test_columns_named_by_two_axes_stay(tmp_path):

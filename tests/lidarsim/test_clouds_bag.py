@@ -10,14 +10,14 @@ from lidarsim.conversion import convert
 
 LAYOUT = np.dtype(
     {
-        "names": ["x", "y", "z", "intensity", "ring"],
-        "formats": ["<f4", "<f4", "<f4", "<f4", "<u2"],
-        "offsets": [0, 4, 8, 16, 20],
-        "itemsize": 24,
+        "names": ["x", "y", "z", "intensity", "ring", "points"],
+        "formats": ["<f4", "<f4", "<f4", "<f4", "<u2", "<u4"],
+        "offsets": [0, 4, 8, 16, 20, 24],
+        "itemsize": 28,
     }
 )
 CLOUD = "sensor_msgs/msg/PointCloud2"
-KINDS = {"x": 7, "y": 7, "z": 7, "intensity": 7, "ring": 4}  # numbers of the message
+KINDS = {"x": 7, "y": 7, "z": 7, "intensity": 7, "ring": 4, "points": 6}  # numbers of the message
 
 
 def scan(seed, num_points=64):
@@ -27,6 +27,7 @@ def scan(seed, num_points=64):
         table[axis] = generator.uniform(2, 30, num_points)
     table["intensity"] = generator.uniform(0, 1, num_points)
     table["ring"] = np.arange(num_points) % 4
+    table["points"] = np.arange(num_points)
     return table
 
 
@@ -89,12 +90,13 @@ def write_recording(folder, suffix, topics, height=1, padding=0):
 def test_scans_of_a_recording_become_files(suffix, tmp_path):
     tables = [scan(0), scan(1)]
     tables[1]["x"][5] = np.nan  # no return
+    tables[1]["intensity"][7] = np.nan
     recording = write_recording(tmp_path, suffix, {"/points": tables})
     for number, source in enumerate((recording, *recording.glob(f"*{suffix}"))):
         line = convert(source, tmp_path / f"scans{number}", to="npz")
         assert line.startswith("2 scans written")
         cloud = read_cloud(tmp_path / f"scans{number}" / "000001.npz")
-        rest = np.delete(tables[1], 5)
+        rest = np.delete(tables[1], [5, 7])
         np.testing.assert_array_equal(cloud.points, np.stack([rest[axis] for axis in "xyz"], 1))
         np.testing.assert_array_equal(cloud.ring, rest["ring"])
         np.testing.assert_array_equal(cloud.intensity, rest["intensity"])
@@ -137,4 +139,5 @@ def test_rows_of_an_image_may_be_padded(tmp_path):
     recording = write_recording(tmp_path, ".mcap", {"/points": [table]}, height=2, padding=8)
     ((_, cloud),) = read_bag(recording)
     np.testing.assert_array_equal(cloud.points[:, 1], table["y"])
+    np.testing.assert_array_equal(cloud.columns["points"], table["points"])
     np.testing.assert_array_equal(cloud.ring, table["ring"])

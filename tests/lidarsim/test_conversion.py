@@ -146,3 +146,30 @@ def test_las_keeps_classes_above_31(points, tmp_path):
     cloud = PointCloud.of(points, classification=classes.astype("u1"))
     write_cloud(tmp_path / "a.las", cloud)
     assert read_cloud(tmp_path / "a.las").columns["classification"].tolist() == classes.tolist()
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("classification", np.uint16([300])),
+        ("classification", np.float32([0.7])),
+        ("return_number", np.int64([20])),
+        ("half", np.float16([0.5])),
+        ("flag", np.bool_([True])),
+        ("a name of more than thirty-two characters", np.float32([0.5])),
+    ],
+)
+def test_las_refuses_what_it_cannot_hold(points, tmp_path, name, values):
+    pytest.importorskip("laspy")
+    cloud = PointCloud.of(points, **{name: np.resize(values, len(points))})
+    message = f"column '{name}' of {values.dtype} does not fit into .las"
+    with pytest.raises(ScanError, match=message):
+        write_cloud(tmp_path / "a.las", cloud)
+    assert not (tmp_path / "a.las").exists()
+
+
+def test_a_full_intensity_is_positive(folder, tmp_path):
+    for full in ("0", "-1"):
+        with pytest.raises(ValueError, match="full_intensity must be positive"):
+            convert(folder, tmp_path / "out", "--to", "npy", f"--full_intensity={full}")
+    assert not (tmp_path / "out").exists()

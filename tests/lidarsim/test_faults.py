@@ -165,3 +165,14 @@ def test_shots_without_a_return_stay_at_the_origin(kind):
     result = Fault(kind, severity=3).apply(RecordedScan(points))
     assert not result.points[::2].any()
     assert 0 < result.report["moved"] <= len(points) // 2
+
+
+def test_shots_without_a_return_have_no_say_in_the_beams():
+    points = SCAN.points.copy()
+    points[:100] = 0  # most of the first beam
+    is_return = points.any(axis=1)
+    fault = Fault("fewer_beams", strength=0.5)
+    whole = fault.apply(RecordedScan(points, ring=SCAN.ring)).points
+    returns = fault.apply(RecordedScan(points[is_return], ring=SCAN.ring[is_return])).points
+    np.testing.assert_array_equal(whole[whole.any(axis=1)], returns)
+    assert (~whole.any(axis=1)).sum() == 100

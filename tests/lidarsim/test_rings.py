@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from sweeps import organised_turn
 
 from lidarsim import Street, load_sensor, simulate_scan
 from lidarsim.faults import Fault
@@ -104,3 +105,17 @@ def test_points_that_weather_adds_last_have_the_rings_of_the_scan(model, beams, 
     assert (found.how, found.num_rings, found.num_shots) == ("order", beams, 520)
     assert (found.ring == ring[::way][foggy.shot])[~added].mean() > 0.99
     assert found.sure == pytest.approx((~added).mean(), abs=0.02)
+
+
+def test_shots_without_a_return_do_not_hide_the_order_of_the_file():
+    points = organised_turn(16).reshape(-1, 3)
+    places = np.sort(np.random.default_rng(0).choice(len(points), 1000, replace=False))
+    rings = rings_of(RecordedScan(np.insert(points, places, 0, axis=0)))
+    assert (rings.num_rings, rings.how) == (16, "order")
+    ring = np.delete(rings.ring, places + np.arange(len(places)))
+    assert ring.tolist() == np.repeat(np.arange(16), 500).tolist()
+
+
+def test_a_beam_may_look_straight_up():
+    points = organised_turn(32, 400, 0.3, 89.9).reshape(-1, 3)
+    assert rings_of(RecordedScan(points)).num_rings == 32

@@ -6,6 +6,7 @@ from dataclasses import fields
 import numpy as np
 import pytest
 import torch
+from sweeps import organised_turn
 
 from lidarsim.realism import measures
 from lidarsim.scan_files import read_scan
@@ -229,6 +230,15 @@ def test_hardly_any_point(num_points):
 def test_points_without_intensity_are_refused():
     with pytest.raises(ValueError, match=r"\(P, 4\).*\(5, 3\)"):
         scan_statistics(np.zeros((5, 3), np.float32))
+
+
+def test_one_odd_intensity_is_cut_and_many_are_refused():
+    points = np.column_stack([organised_turn().reshape(-1, 3), np.full(4000, 0.5, np.float32)])
+    points[5, 3] = 1.01  # a file may hold one of 1000 such values
+    assert scan_statistics(points).num_intensity_scans == 1
+    points[:9, 3] = 181
+    with pytest.raises(ValueError, match=r"in \[0, 1\], got 0\.5 to 181; divide by"):
+        scan_statistics(points)
 
 
 @pytest.mark.data

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from sweeps import organised_turn
 
 from lidarsim import Simulator, load_sensor
 from lidarsim.clouds import PointCloud
@@ -200,6 +201,25 @@ def test_shots_without_a_return_at_the_origin_are_left_out(vlp16_scans, tmp_path
         assert (estimated.sensor.num_beams, estimated.beams_by) == (16, "the order")
         assert estimated.sensor.shots == load_sensor("vlp16").shots
         assert estimated.sensor.min_range_m > 0.1
+
+
+def test_range_limits_are_measured_from_the_sensor():
+    """Not from the origin of a vehicle, 2 m below it."""
+    turn = organised_turn()
+    one, above = (estimate([points]).sensor for points in (turn, turn + np.float32([0, 0, 2])))
+    limits = [(sensor.min_range_m, sensor.max_range_m) for sensor in (one, above)]
+    assert limits[0] == pytest.approx(limits[1], abs=0.1)
+
+
+def test_columns_of_scans_are_as_many():
+    with pytest.raises(ValueError, match="the scans have 250 and 500 columns: give scans of one"):
+        estimate([organised_turn(), organised_turn()[:, ::2]])
+
+
+def test_one_odd_intensity_does_not_change_the_full_scale():
+    points = np.column_stack([organised_turn().reshape(-1, 3), np.full(4000, 0.5, np.float32)])
+    points[5, 3] = 1.01
+    assert estimate([PointCloud.of(points)]).full_intensity == 1
 
 
 def test_scans_that_show_no_spinning_sensor_are_refused(vlp16_scans):

@@ -64,6 +64,7 @@ def test_a_written_sensor_is_read_again(tmp_path):
         ({"lasers": {"height_m": [0, 0]}}, "inclination_rad"),
         ({"lasers": {"inclination_deg": [0, 1]}}, "must fall from beam to beam"),
         ({"sensor": {"shots": 3}}, "shots must be at least 8"),
+        ({"sensor": {"shots": 1800.5}}, "shots must be a whole number"),
         ({"sensor": {"min_range_m": "near"}}, "could not convert"),
     ],
 )
@@ -72,6 +73,15 @@ def test_wrong_files_say_what_is_wrong(tmp_path, change, message):
     path.write_text(yaml.safe_dump({"lasers": {"inclination_deg": [1.0, 0.0]}} | change))
     with pytest.raises(ValueError, match=rf"mine\.yaml: .*{message}"):
         load_sensor(path)
+
+
+def test_heights_of_velodyne_pointcloud_are_measured_across_the_beam(tmp_path):
+    """There a point is at ``d cos v - offset sin v`` and ``d sin v + offset cos v``."""
+    laser = {"vert_correction": -0.42, "vert_offset_correction": 0.15}
+    (tmp_path / "a.yaml").write_text(yaml.safe_dump({"lasers": [laser]}))
+    distance_m = 0.15 * np.tan(-0.42)  # on the axis
+    height_m = distance_m * np.sin(-0.42) + 0.15 * np.cos(-0.42)
+    assert load_sensor(tmp_path / "a.yaml").lasers.height_m[0] == pytest.approx(height_m)
 
 
 def test_the_range_image_of_a_preset_has_a_row_for_each_beam():

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 
@@ -43,6 +45,16 @@ def test_figures_by_hand():
     assert figures["missing_iou"] == 0
     assert figures["flying"] == pytest.approx(1 / 7)
     assert figures["flying_scans"] == 0
+
+
+def test_what_nothing_was_compared_for_is_unknown():
+    full = torch.full((1, 4, 8), 10.0)
+    quality = ReconstructionQuality()
+    quality.update(full, -full)
+    figures = quality.compute()
+    unknown = {name for name, figure in figures.items() if math.isnan(figure)}
+    assert unknown == {"range_error_m", "median_error_m", "edge_error_m", "flying"}
+    assert figures["return_iou"] == figures["missing_iou"] == 0
 
 
 def test_merged_states_equal_one_update():

@@ -128,6 +128,7 @@ class TestSafety:
     [
         ({"points": np.ones((3, 2))}, r"s: points must be \(P, 3\) or \(P, 4\), got \(3, 2\)"),
         ({"points": np.full((3, 3), np.nan)}, "s: has NaN or infinite values"),
+        ({"labels": np.zeros(2, int)}, r"s: labels must be \(3,\), got \(2,\)"),
     ],
 )
 def test_errors_say_which_scan_and_what_is_wrong(change, message):

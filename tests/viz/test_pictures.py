@@ -257,6 +257,12 @@ def test_a_small_part_is_shown_with_its_surroundings(part, expected):
     assert shown_columns(*part) == expected
 
 
+def test_parts_differ_in_colour_as_long_as_there_are_colours():
+    names = [f"part {number}" for number in range(14)]
+    assert len(set(viz.figures.part_colours(names[:12]))) == 12
+    assert len(viz.figures.part_colours(names)) == 14
+
+
 def test_a_mask_is_drawn_on_grey_and_colours_its_part_alone():
     parts = np.zeros((8, 16), np.uint8)
     parts[:, 8:] = 1

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarsim.cloud_formats import ODD_SHARE
 from lidarsim.clouds import find_files
 from lidarsim.ground import ground_around, plane_of
 from lidarsim.io import number_of
@@ -157,6 +158,10 @@ def estimate_sensor(scans: Sequence[Any] | str | Path) -> SensorEstimate:
     if not len(scans):
         raise ValueError("no scans given")
     read = [read_scan_of(scan, number) for number, scan in enumerate(scans)]
+    widths = {scan.num_columns for scan in read if scan.num_columns}
+    if len(widths) > 1:
+        named = " and ".join(map(str, sorted(widths)))
+        raise ValueError(f"the scans have {named} columns: give scans of one mode")
     points, notes = combine(read)
     distance_m = np.hypot(points.xyz[:, 0], points.xyz[:, 1])
     beams = fit_beams(points.beam, distance_m, points.xyz[:, 2])
@@ -177,7 +182,8 @@ def estimate_sensor(scans: Sequence[Any] | str | Path) -> SensorEstimate:
     notes += _notes_on_columns(columns, covered_deg)
 
     height_m, mount, mount_notes = _mount(read, beams)
-    range_m = np.sqrt(np.square(points.xyz).sum(axis=1))
+    up_m = float((beams.height_m - height_m)[0])  # of the sensor in the frame of a vehicle
+    range_m = np.sqrt(np.square(points.xyz - (0, 0, up_m)).sum(axis=1))
     settings: dict[str, Any] = {} if mount is None else {"mount_height_m": round(mount.height_m, 4)}
     sensor = SpinningLidar(
         _lasers(beams, columns, offset, height_m),
@@ -407,8 +413,11 @@ def _residual_quantiles(beam: Indices, residual: Floats) -> Floats:
 
 
 def _full_intensity(read: Sequence[SensorScan]) -> float | None:
-    columns = [scan.cloud.intensity for scan in read]
-    largest = max((float(column.max()) for column in columns if column is not None), default=None)
-    if largest is None:
+    columns = [scan.cloud.intensity for scan in read if scan.cloud.intensity is not None]
+    if not columns:
         return None
-    return next((full for full in (1.0, 255.0, 65535.0) if largest <= full), largest)
+    values = np.concatenate(columns)
+    if values.dtype.kind == "f" and np.count_nonzero(values > 1) <= ODD_SHARE * len(values):
+        return 1.0
+    largest = float(values.max())
+    return next((full for full in (255.0, 65535.0) if largest <= full), largest)

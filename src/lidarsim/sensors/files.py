@@ -163,9 +163,12 @@ def _content(path: Path, content: Any) -> SensorFile:
 
 def _calibrated_lasers(lasers: list[Any]) -> Lasers:
     table = sorted(lasers, key=lambda laser: -laser["vert_correction"])
-    return _lasers(
-        {name: [laser.get(key, 0.0) for laser in table] for name, key in _CALIBRATION.items()}
-    )
+    columns = {
+        name: np.array([laser.get(key, 0.0) for laser in table], float)
+        for name, key in _CALIBRATION.items()
+    }
+    columns["height_m"] /= np.cos(columns["inclination_rad"])  # it is measured across the beam
+    return _lasers(columns)
 
 
 def _lasers(columns: Mapping[str, Any]) -> Lasers:

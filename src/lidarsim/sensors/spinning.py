@@ -92,6 +92,7 @@ class SpinningLidar:
     return_mode: Literal["strongest", "dual"] = "strongest"  # or the two strongest of a shot
 
     def __post_init__(self) -> None:
+        check_fields(self, "be a whole number, 0 or greater", "shots")
         if self.shots < 8:
             raise ValueError(f"shots must be at least 8 per turn, got {self.shots}")
         check_fields(

@@ -6,6 +6,7 @@ import copy
 from collections.abc import Callable, Iterator
 from typing import Any, Literal
 
+import torch
 from torch import Tensor, nn
 
 from r3dpa.baselines.diffusion_paths import repaint
@@ -111,7 +112,9 @@ class Baseline(Stage):
         resamplings: int,
     ) -> Tensor:
         """Samples ``(B, C, h, w)`` that are ``known`` where the mask ``(B, 1, h, w)`` is 1."""
-        return repaint(velocity, known, mask, draws, self.interpolant, sampler.steps, resamplings)
+        path, steps = self.interpolant, sampler.steps
+        samples = repaint(velocity, known, mask, draws, path, steps, resamplings)
+        return torch.where(mask > 0, known, samples)  # a diffusion ends with some noise
 
     def settings(self) -> dict[str, Any]:
         """Plain values of the constructor arguments that sampling depends on, but for networks."""
@@ -123,6 +126,11 @@ class Baseline(Stage):
         """Check the data, and give a network with ``coords`` the ray angles of their pixels."""
         _, geometry = self.attach_scans()
         sensor = geometry.projection.sensor
+        if geometry.codec.without_further() != geometry.codec:
+            raise ValueError(
+                f"stage {self.stage} generates no intensity_channel and no classes: set "
+                "codec.intensity_channel of the data to false and codec.num_classes to 0"
+            )
         wanted = (geometry.codec.channels, sensor.beams, sensor.columns)
         if self.image_shape() != wanted:
             raise ValueError(

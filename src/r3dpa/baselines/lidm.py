@@ -40,6 +40,8 @@ class ReleasedDDIM(SamplerConfig):
         interpolant: Interpolant,
     ) -> Tensor:
         """Solve as :meth:`SamplerConfig.solve` does; the list determines the number of steps."""
+        if self.solver not in ("ddpm", "ddim") or self.shift != 1:  # not of the released code
+            return super().solve(velocity, noise, draws, interpolant)
         times = released_times(self.steps)
         eta = self.eta if self.solver == "ddpm" else 0.0
         return ancestral(velocity, noise, times, draws, eta=eta, interpolant=interpolant)
@@ -54,7 +56,7 @@ def released_times(num: int, num_steps: int = 1000) -> Tensor:
     Raises:
         ValueError: If the list would reach beyond the last step, as for 3 or 256 steps.
     """
-    chosen = torch.arange(0, num_steps, num_steps // num) + 1
+    chosen = torch.arange(0, num_steps, max(num_steps // num, 1)) + 1
     if chosen[-1] >= num_steps:
         raise ValueError(
             f"DDIM of LiDM cannot take {num} of {num_steps} steps: its list would end at step "

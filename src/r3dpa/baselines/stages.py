@@ -42,6 +42,11 @@ def baseline_generator(
             f"quality {sampler} is not measured for stage {checkpoint.stage}: give --solver and "
             "--steps, or neither for its published sampler"
         )
+    if sampler is not None and sampler.solver == "average_velocity":
+        raise ValueError(
+            f"solver average_velocity needs a checkpoint of stage few_step, and {checkpoint.path} "
+            f"is of stage {checkpoint.stage}: choose another solver"
+        )
     for name in ("autoguidance", "decoder", "guidance_scale"):
         if options.pop(name, None) not in (None, "full", 1.0):
             raise ValueError(f"{name} is not for stage {checkpoint.stage}; leave it out")

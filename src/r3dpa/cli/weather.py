@@ -40,7 +40,8 @@ def weather(
         effects: ``off`` or ``on`` by effect, such as ``--effects.range_noise on``.
         **options: See :class:`FolderOptions`.
     """
-    if weather == Weather() and not any(on in ("on", True) for on in (effects or {}).values()):
+    blooms = (effects or {}).get("blooming") in ("on", True)  # alone, other effects change nothing
+    if weather == Weather() and not blooms:
         raise ValueError(
             "no weather is given, so that scans would stay as they are: give an option such as "
             "--weather.visibility_m 60 or --weather.rain_mm_h 10"

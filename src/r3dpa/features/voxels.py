@@ -220,7 +220,8 @@ class Masking:
         scan = prepare_scan(points, self.grid)
         blocks = _block(points[scan.kept])
         share = rng.uniform(0, self.max_hidden)
-        hidden = torch.from_numpy(rng.random(int(blocks.max()) + 1) < share)[blocks]
+        num_blocks = int(blocks.max()) + 1 if len(blocks) else 0
+        hidden = torch.from_numpy(rng.random(num_blocks) < share)[blocks]
         targets = torch.empty(len(hidden), 0)
         if self.geometry:
             targets = self.describe(points, scan)

@@ -252,7 +252,8 @@ def _path_nodes(
     time = times.double().cpu()
     path = interpolant.coefficients(time)
     log_snr = (path.alpha / path.sigma).log()
-    log_snr[time == 1] = -math.inf  # on the cosine path rounding keeps it finite
+    # Rounding keeps it finite on the cosine path, and diffusions end just before both.
+    log_snr[time == 1], log_snr[time == 0] = -math.inf, math.inf
     nodes = [PathCoefficients(*row) for row in torch.stack(path, dim=1).tolist()]
     return nodes, log_snr.diff().tolist()
 

@@ -91,6 +91,7 @@ def view_of(range_m: Tensor, source: Projection, target: BeamProjection) -> tupl
         source: Projection of these images.
         target: Projection of :func:`projection_for`.
     """
+    has_return = range_m > 0
     if isinstance(source, SphericalProjection):
         range_m = _fill_missed_rows(range_m)
     size = (len(range_m), target.sensor.beams, target.sensor.columns)
@@ -99,7 +100,11 @@ def view_of(range_m: Tensor, source: Projection, target: BeamProjection) -> tupl
         guess = torch.where(seen > 0, seen, _FIRST_GUESS_M)
         view = _read_at(unproject(guess, target), source)
         seen = _interpolated(range_m, view)
-    return _inside(seen, target.sensor), view
+    # A filled pixel has no values: they are read in the row beside it.
+    batch, share = torch.arange(len(seen), device=seen.device)[:, None, None], view.share
+    for rows, other in ((view.above, 1.0), (view.below, 0.0)):
+        share = torch.where(has_return[batch, rows, view.column], share, other)
+    return _inside(seen, target.sensor), view._replace(share=share)
 
 
 def values_in(values: Tensor, view: View, range_m: Tensor) -> Tensor:

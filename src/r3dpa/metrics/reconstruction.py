@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 from torchmetrics import Metric
@@ -103,13 +105,14 @@ class ReconstructionQuality(Metric):
         """Return the figures by name."""
 
         def ratio(numerator: str, denominator: str) -> float:
-            return getattr(self, numerator).item() / max(1, getattr(self, denominator).item())
+            total = getattr(self, denominator).item()
+            return getattr(self, numerator).item() / total if total else math.nan
 
         below = self.histogram.cumsum(0)
         median = int((below < below[-1] / 2).sum())
         return {
             "range_error_m": ratio("error_m", "returns_of_both"),
-            "median_error_m": (median + 0.5) * _BIN_M,
+            "median_error_m": (median + 0.5) * _BIN_M if below[-1] else math.nan,
             "edge_error_m": ratio("error_at_edges_m", "edges"),
             "return_iou": ratio("returns_of_both", "returns_of_either"),
             "missing_iou": ratio("missing_of_both", "missing_of_either"),

@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 import r3dpa
 from lidarsim.clouds import check_metres
-from lidarsim.scan_files import read_beside, read_clouds
+from lidarsim.scan_files import ScanError, read_beside, read_clouds
 from r3dpa import viz
 from r3dpa.checkpoints import Checkpoint, read_snapshot
 from r3dpa.data.labels import find_labels
@@ -137,7 +137,10 @@ def page_scans(source: Path, columns: Sequence[str] = ()) -> list[Callable[[], v
     """
 
     def read(name: str, path: Path) -> viz.PageScan:
-        (points,) = read_clouds(path, columns).values()
+        clouds = read_clouds(path, columns)
+        if len(clouds) > 1:
+            raise ScanError(f"{path}: holds {len(clouds)} scans: give the file alone, or remove it")
+        (points,) = clouds.values()
         check_metres(path, points)
         if path.suffix != ".bin":
             return viz.PageScan(name, points)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from typing import NamedTuple
 
 import numpy as np
@@ -232,7 +233,7 @@ def _columns_around_parts(rows: Sequence[EditRow]) -> tuple[int, int] | None:
 
 def part_colours(names: Sequence[str]) -> list[str]:
     """A colour ``#rrggbb`` for each part; grey for ``kept``."""
-    free = iter(("#ff6b6b", *PALETTE))
+    free = cycle(dict.fromkeys(("#ff6b6b", *PALETTE)))
     return [_GREY if name == _KEPT else next(free) for name in names]
 
 

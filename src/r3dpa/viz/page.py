@@ -209,6 +209,9 @@ def pack_scan(scan: PageScan) -> tuple[dict[str, Any], str]:
         raise ValueError(f"{scan.name}: points must be (P, 3) or (P, 4), got {points.shape}")
     if not np.isfinite(points).all():
         raise ValueError(f"{scan.name}: has NaN or infinite values; drop these points first")
+    for name, values in (("labels", scan.labels), ("origins", scan.origins)):
+        if values is not None and values.shape != (count,):
+            raise ValueError(f"{scan.name}: {name} must be ({count},), got {values.shape}")
     step_m = max(STEP_M, float(np.abs(points[:, :3]).max()) / 32767)
     steps = np.rint(points[:, :3] / step_m).astype("<i2")
     columns = ["x", "y", "z"]
