@@ -16,9 +16,30 @@ TABLES = Path(__file__).resolve().parents[2] / "conf" / "ablation"
 SEEDS = ("seed_everything", "model.init_args.seed", "data.init_args.seed", "scorer.seed")
 
 
-def plan_of(scale, seeds=(0,), tables=TABLES, **more):
+def words_alone(words):
+    """Stands for a configuration where only words matter: parsing takes a second per training."""
+    return {"words": list(words)}
+
+
+def plan_of(scale, seeds=(0,), tables=TABLES, resolve=resolved, **more):
     scale = TABLES / "scale" / f"{scale}.yaml" if isinstance(scale, str) else scale
-    return make_plan(tables, scale, seeds, Path("out"), resolved, **more)
+    return make_plan(tables, scale, seeds, Path("out"), resolve, **more)
+
+
+@pytest.fixture
+def shipped(tmp_path):
+    """``shipped(table_1=["r2dm"])``: folder of shipped tables with these rows alone."""
+
+    def write(**rows):
+        folder = tmp_path / "tables"
+        folder.mkdir()
+        for name, keys in rows.items():
+            table = yaml.safe_load((TABLES / f"{name}.yaml").read_text())
+            given = {"caption": "", "rows": {key: table["rows"][key] for key in keys}}
+            (folder / f"{name}.yaml").write_text(yaml.safe_dump(given, sort_keys=False))
+        return folder
+
+    return write
 
 
 def rows_of(plan):
@@ -31,7 +52,7 @@ def names_of(stages):
 
 def test_trainings_that_rows_share_are_planned_once():
     """Table II ends as table III begins; every stage comes after those that it starts from."""
-    plan = plan_of("demo")
+    plan = plan_of("demo", resolve=words_alone)
     rows = rows_of(plan)
     last, first = rows["table_2", "aligned"], rows["table_3", "none"]
     assert names_of(last.stages[0]) == names_of(first.stages[0])
@@ -42,8 +63,9 @@ def test_trainings_that_rows_share_are_planned_once():
     assert all(len(row.published) == 6 for row in rows.values())
 
 
-def test_trainings_of_table_1_are_those_of_the_paper_and_the_others_its_ablations():
-    plan = plan_of("paper")
+def test_trainings_of_table_1_are_those_of_the_paper_and_the_others_its_ablations(shipped):
+    tables = {"table_1": ["lidm_ape", "r3dpa"], "table_3": ["joint"], "table_4": ["unet", "sit"]}
+    plan = plan_of("paper", tables=shipped(**tables))
     rows = rows_of(plan)
     steps = {
         key: {stage.words[0]: stage.config["trainer"]["max_steps"] for stage in row.stages[0]}
@@ -60,7 +82,7 @@ def test_trainings_of_table_1_are_those_of_the_paper_and_the_others_its_ablation
 
 
 def test_a_second_seed_repeats_all_but_the_prior():
-    one, two = plan_of("demo"), plan_of("demo", (0, 1))
+    one, two = (plan_of("demo", seeds, resolve=words_alone) for seeds in ((0,), (0, 1)))
     prior = [stage for stage in one.stages if not stage.on_scans]
     assert len(two.stages) == 2 * len(one.stages) - len(prior)
     assert set(names_of(one.stages)) < set(names_of(two.stages))
@@ -76,21 +98,23 @@ def test_the_name_depends_on_given_weights_which_replace_the_prior(tmp_path):
     for content in ("one", "other"):
         weights = tmp_path / f"{content}.pt"
         weights.write_text(content)
-        rows = rows_of(plan_of("demo", tables=TABLES / "table_2", rgb_weights=weights))
+        plan = plan_of("demo", (0,), TABLES / "table_2", words_alone, rgb_weights=weights)
+        rows = rows_of(plan)
         assert str(weights) in rows["table_2", "rgb"].stages[0][-1].words
         names.append({key: set(names_of(row.stages[0])) for (_, key), row in rows.items()})
     assert names[0]["scratch"] == names[1]["scratch"]
     assert not names[0]["aligned"] & names[1]["aligned"]
 
 
-def test_the_name_depends_on_the_training_not_on_the_test_or_the_folder(tmp_path):
+def test_the_name_depends_on_the_training_not_on_the_test_or_the_folder(tmp_path, shipped):
     scale = yaml.safe_load((TABLES / "scale" / "demo.yaml").read_text())
-    usual = names_of(plan_of("demo", tables=TABLES / "table_4").stages)
+    tables = shipped(table_4=["sit"])
+    usual = names_of(plan_of("demo", tables=tables).stages)
     for section, key, out in (("scorer", "num_scenes", "a"), ("trainer", "max_steps", "b/c")):
         scale["config"][section][key] += 1
         (tmp_path / "demo.yaml").write_text(yaml.safe_dump(scale))
         file, out = tmp_path / "demo.yaml", tmp_path / out
-        plan = make_plan(TABLES / "table_4.yaml", file, (0,), out, resolve_config)
+        plan = make_plan(tables, file, (0,), out, resolve_config)
         assert (names_of(plan.stages) == usual) == (section == "scorer")
 
 
@@ -105,13 +129,14 @@ def test_an_unknown_released_row_is_refused_before_anything_is_planned():
         make_plan(TABLES, scale, (0,), Path("out"), resolve, released={"nope": Path("x")})
 
 
-def test_released_files_stand_for_trainings(tmp_path, monkeypatch):
+def test_released_files_stand_for_trainings(shipped, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # jobs write their configuration into the folder of the plan
     weights, samples = tmp_path / "r2dm.pth", tmp_path / "samples"
     weights.write_bytes(b"weights")
     samples.mkdir()
     released = {"r2dm": weights, "ultralidar": samples}
-    plan = plan_of("demo", tables=TABLES / "table_1", released=released)
+    tables = shipped(table_1=["ultralidar", "r2dm", "r3dpa"])
+    plan = plan_of("demo", tables=tables, released=released)
     rows = rows_of(plan)
     assert next(key for _, key in rows) == "ultralidar"
     assert not any(stage.words[0] == "r2dm" for stage in plan.stages)
@@ -130,11 +155,13 @@ def test_released_files_stand_for_trainings(tmp_path, monkeypatch):
     assert again[test.name].content != test.content  # of other samples
 
 
-def test_released_weights_are_sampled_and_measured_as_trained_ones(tmp_path, monkeypatch):
+def test_released_weights_are_sampled_and_measured_as_trained_ones(shipped, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     weights = tmp_path / "r3dpa.pt"
     weights.write_bytes(b"weights")
-    plan = plan_of("paper", released={"r3dpa": weights})
+    # The other row has the settings of the reference.
+    tables = shipped(table_1=["r3dpa"], table_4=["sit"])
+    plan = plan_of("paper", tables=tables, released={"r3dpa": weights})
     jobs = {job.name: job for job in plan_jobs(plan)}
     (stage,) = rows_of(plan)["table_1", "r3dpa"].stages[0]
     sampled, test = jobs[stage.name].words, jobs[f"test of {stage.name}"].words
@@ -171,16 +198,16 @@ def test_a_wrong_row_is_named(row, message, tmp_path):
 def test_tables_of_r3dpa_s_share_trainings_and_features(tmp_path, monkeypatch):
     """Six VAEs, twelve flows and three joint trainings of three seeds, after one prior."""
     monkeypatch.chdir(TABLES.parents[1])  # the scale names files of the checkout
-    scale = TABLES / "scale" / "s.yaml"
+    scale, seeds = TABLES / "scale" / "s.yaml", (0, 1, 2)
     plans = [
-        make_plan(TABLES / name, scale, (0, 1, 2), tmp_path, resolved)
+        make_plan(TABLES / name, scale, seeds, tmp_path, words_alone)
         for name in ("table_2", "table_3")
     ]
     names = {stage.name for plan in plans for stage in plan.stages}
     kinds = Counter(name.partition("-")[0] for name in names)
     assert kinds.pop("image_vae") == kinds.pop("rgb_pretraining") == 1
     assert kinds == {"vae_alignment": 6, "flow_matching": 12, "joint": 3}
-    jobs = plan_jobs(plans[0])
+    jobs = plan_jobs(make_plan(TABLES / "table_3", scale, seeds, tmp_path, resolved))
     data = str(tmp_path / "data.yaml")
     assert jobs[0].words == ["features", "--data", data, "--grid_sizes", "[[8, 32]]"]
     parser = features_parser("test")  # the options of the scans fit each other

@@ -5,9 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fault_commands import Command, fit_words
+from tiny_baselines import fit_words as baseline_words
 from tiny_networks import tiny_checkpoint
 
 from r3dpa.callbacks import scene_scoring
+from r3dpa.cli import main
 from r3dpa.metrics import scene
 
 
@@ -21,6 +23,18 @@ def tiny_file(tmp_path_factory):
     """Checkpoint of random weights for images of 16 x 64, without a training."""
     path = tmp_path_factory.mktemp("tiny") / "tiny.safetensors"
     return tiny_checkpoint(path, step=3, feature_source="geometric")
+
+
+@pytest.fixture(scope="session")
+def baseline_once(smoke_root, make_once):
+    """``baseline_once(stage)``: last checkpoint of a tiny baseline, trained for three steps."""
+
+    def checkpoint(stage, *more):
+        words = ["fit", stage, smoke_root]
+        folder = make_once(stage, lambda run_dir: main(baseline_words(*words, run_dir, *more)))
+        return folder / "checkpoints" / "last.ckpt"
+
+    return checkpoint
 
 
 @pytest.fixture(scope="module")

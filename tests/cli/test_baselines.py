@@ -21,17 +21,15 @@ from r3dpa.stages import scene_generator
 
 
 @pytest.fixture(scope="module", params=TINY)
-def trained(request, smoke_root, tmp_path_factory):
+def trained(request, baseline_once):
     """Stage and checkpoint of three steps."""
-    run_dir, more = tmp_path_factory.mktemp(request.param), []
+    more = []
     if request.param in FIRST_STAGES:
         stage, _ = FIRST_STAGES[request.param]
-        main(fit_words("fit", stage, smoke_root, run_dir / "first"))
-        first = run_dir / "first/checkpoints/last.ckpt"
+        first = baseline_once(stage)
         assert read_checkpoint(first).stage == stage
         more = [f"--model.init_args.init_from={first}"]
-    main(fit_words("fit", request.param, smoke_root, run_dir, *more))
-    return request.param, run_dir / "checkpoints" / "last.ckpt"
+    return request.param, baseline_once(request.param, *more)
 
 
 def test_every_baseline_is_tested_here():
@@ -72,8 +70,9 @@ def test_sample_and_convert(trained, tmp_path):
     main(["convert", str(path), str(exported)])
     with pytest.raises(ValueError, match=f"stage {stage}, which has no official R3DPA layout"):
         main(["convert", str(path), str(tmp_path / "back.pt"), "--to", "official"])
-    with pytest.raises(ValueError, match=r"weights\.safetensors is no \.ckpt of a run; scenes of"):
-        main(["test", stage, "--preset", "demo", "--ckpt_path", str(exported)])
+    if stage == "lidm":  # any stage would do
+        with pytest.raises(ValueError, match=r"weights\.safetensors is no \.ckpt of a run; scenes"):
+            main(["test", stage, "--preset", "demo", "--ckpt_path", str(exported)])
     words = ["--num", "2", "--pictures", "0", "--solver", "euler", "--steps", "2"]
     for source, out in ((path, tmp_path / "a"), (exported, tmp_path / "b")):
         main(["sample", "--ckpt", str(source), "--out", str(out), *words])

@@ -6,11 +6,13 @@ Networks and images are tiny here; the slow tests start them at their own sizes.
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 import yaml
 from fault_commands import Command
 
+from r3dpa import viz
 from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint
 from r3dpa.cli import main
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
@@ -35,13 +37,12 @@ ELSEWHERE = {  # by the test that starts them
     ),
 }
 EXPERIMENTS = ("vae_alignment", "joint", "joint_unet", "flow_matching", "few_step")
-STARTS = {  # data by overlay of the demo or experiment; test_stages starts the experiments alone
+STARTS = {  # data by overlay of the demo; the experiments alone are started by `smoke_args`
     "demo/vae_alignment": "kitti360",
     "demo/joint": "demo_folder",
-    "demo/joint_unet": "demo",
+    "demo/joint_unet": "folder",
     "demo/flow_matching": "demo",
     "demo/few_step": "simulated",
-    "experiment/joint": "folder",
 }
 R3DPA_S = {  # in the order given
     "trained": ("data", "vae_alignment"),
@@ -104,8 +105,10 @@ def test_no_file_is_left_out():
 
 
 @pytest.fixture
-def start(tmp_path, caplog):
-    """``start(configs, settings)`` runs ``r3dpa fit`` for one batch."""
+def start(tmp_path, caplog, monkeypatch):
+    """``start(configs, settings)`` runs ``r3dpa fit`` for one batch, with blank pictures."""
+    for name in ("scenes_sheet", "reconstruction_figure"):  # drawn in tests/callbacks
+        monkeypatch.setattr(viz, name, lambda *_: np.zeros((2, 2, 3), np.uint8))
 
     def start(configs, settings):
         files = [name if isinstance(name, Path) else CONF / f"{name}.yaml" for name in configs]
@@ -148,10 +151,8 @@ def net(name):
 @pytest.mark.parametrize(("experiment", "data"), STARTS.items())
 def test_experiments_with_tiny_networks(experiment, data, start, smoke_root, tmp_path):
     """Each with other data, all of which are the scans of the smoke size here."""
-    folder, stage = experiment.split("/")
-    configs = ["trainer", f"data/{data}", f"experiment/{stage}"]
-    if folder == "demo":
-        configs += ["demo/trainer", experiment]
+    stage = experiment.removeprefix("demo/")
+    configs = ["trainer", f"data/{data}", f"experiment/{stage}", "demo/trainer", experiment]
     smoke = yaml.safe_load((CONF / "smoke.yaml").read_text())
     smoke_file = "smoke"
     if stage == "joint_unet":  # whose network has other arguments
@@ -204,7 +205,7 @@ def test_r3dpa_s_and_its_demo_start(name, start, smoke_root, tmp_path):
     if "demo_folder" in given:
         settings["data.init_args.scans"] = smoke_root
     else:
-        settings |= {"data.init_args.root": tmp_path / "data", "data.init_args.num_scans": 4}
+        settings |= {"data.init_args.root": tmp_path / "data", "data.init_args.num_scans": 2}
     if name != "trained":
         codec = RangeCodec("log2", return_channel=True)
         exported = None if name == "flow" else sit
@@ -219,7 +220,7 @@ def test_r3dpa_s_and_its_demo_start(name, start, smoke_root, tmp_path):
 )
 def test_the_second_edition_of_r3dpa_s_starts(name, start, tmp_path):
     vae, sit, settings = small_r3dpa_s("r3dpa_s_2", "[2, 2]")
-    settings |= {"data.init_args.root": tmp_path / "data", "data.init_args.num_scans": 4}
+    settings |= {"data.init_args.root": tmp_path / "data", "data.init_args.num_scans": 2}
     if "teacher" in R3DPA_S_2[name]:
         settings["data.init_args.extractor"] = (
             f"{{class_path: {GEOMETRIC}, init_args: {{dim: 128}}}}"

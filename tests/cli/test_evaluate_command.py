@@ -20,7 +20,6 @@ from r3dpa.viz import evaluation as figures
 pytestmark = pytest.mark.usefixtures("coarse_protocols")
 
 SENSOR = LidarSensor(beams=16, columns=64)
-PICTURES = {"birds_eye.png", "matches.png", "ranges.png"}
 FILES = {"evaluation.json", "metrics.csv", "table.md", "table.tex"}
 
 
@@ -66,8 +65,10 @@ def samples(tmp_path):
 
 @pytest.fixture
 def no_figures(monkeypatch):
-    """Most of the time of a comparison; one test draws them."""
-    monkeypatch.setattr(figures, "save_figures", lambda *_, **__: None)
+    """Folders to which figures would go; test_test_command.py draws them, for half of the time."""
+    folders = []
+    monkeypatch.setattr(figures, "save_figures", lambda folder, **_: folders.append(folder))
+    return folders
 
 
 def evaluate(*words):
@@ -102,7 +103,7 @@ def test_a_reference_of_another_format_is_refused_before_scans_are_read(data, tm
         command.reference(data=data, out=tmp_path / "ref.npy", spaces=("fgeo",))
 
 
-def test_samples_are_compared_with_a_reference(data, samples, tmp_path, capsys):
+def test_samples_are_compared_with_a_reference(data, samples, no_figures, tmp_path, capsys):
     """In the default spaces, on few scans and samples: FWID is a large network."""
     reference, out = tmp_path / "ref.safetensors", tmp_path / "results"
     words = ["--data", data, "--out", reference, "--limit", 4, "--device", "cpu"]
@@ -126,7 +127,8 @@ def test_samples_are_compared_with_a_reference(data, samples, tmp_path, capsys):
         assert re.search(rf"^{re.escape(metric)}[ x]", printed, re.MULTILINE), metric
     assert "published" not in printed  # the scans are not KITTI-360
     assert re.search(r"^\| ours +\| +[-\d]", printed, re.MULTILINE)
-    assert {path.name for path in out.iterdir()} == FILES | PICTURES
+    assert {path.name for path in out.iterdir()} == FILES
+    assert no_figures == [out]
     stored = Evaluation.load(out / "evaluation.json")
     assert stored.label == "ours"
     assert (stored.row("JSD").num_samples, stored.row("JSD").num_references) == (3, 4)

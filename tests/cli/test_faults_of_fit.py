@@ -213,15 +213,16 @@ READERS = {
 }
 
 
-@pytest.mark.parametrize("reader", READERS)
+@pytest.mark.parametrize(
+    ("reader", "is_empty"), [*((r, False) for r in READERS), ("convert", True)]
+)
 def test_a_checkpoint_cut_short_is_refused_before_anything_is_written(
-    reader, scans_folder, tmp_path
+    reader, is_empty, scans_folder, tmp_path
 ):
     ckpt = tmp_path / "last.ckpt"
     torch.save({"state_dict": {"weight": torch.zeros(1000)}}, ckpt)
     words = READERS[reader](ckpt, tmp_path / "out", scans_folder)
-    for kept in (ckpt.stat().st_size - 1, 0):
-        os.truncate(ckpt, kept)
-        with pytest.raises(ValueError, match=f"cannot read {ckpt}: .*damaged"):
-            main([str(word) for word in words])
+    os.truncate(ckpt, 0 if is_empty else ckpt.stat().st_size - 1)
+    with pytest.raises(ValueError, match=f"cannot read {ckpt}: .*damaged"):
+        main([str(word) for word in words])
     assert not [path for path in tmp_path.rglob("*") if path.is_file() and path != ckpt]

@@ -45,7 +45,7 @@ def jobs(scans_folder, tmp_path_factory):
     ckpt = tiny_checkpoint(folder / "tiny.safetensors")
     return {
         "simulate": Job(
-            ["simulate", "--scans", 6, "--sensor", lasers],
+            ["simulate", "--scans", 3, "--sensor", lasers],
             At("pathlib.Path.replace", None, call=2, match=".bin"),
             1000,
         ),
@@ -54,7 +54,7 @@ def jobs(scans_folder, tmp_path_factory):
             At("r3dpa.modules.feature_extraction.pooled_grids", None, call=4),
         ),
         "sample": Job(
-            ["sample", "--ckpt", ckpt, "--num", 6, "--batch_size", 1, *sampler],
+            ["sample", "--ckpt", ckpt, "--num", 4, "--batch_size", 1, *sampler],
             At("r3dpa.generation.SceneGenerator.generate", None, call=4),
         ),
         "reference": Job(

@@ -20,7 +20,7 @@ from r3dpa.features.scalr import official_name
 from r3dpa.geometry import LidarSensor, SphericalProjection
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
-NUM = 30
+NUM = 20
 PROJECTION = SphericalProjection(LidarSensor(beams=16, columns=64))
 GEOMETRIC = {"class_path": "r3dpa.features.GeometricFeatures", "init_args": {"dim": 16}}
 QUIET = ["--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false"]
@@ -175,8 +175,8 @@ def test_two_processes_write_what_one_does(data, expected):
 
 
 def cached_images(root, codec):
-    """Data YAML of four simulated scans that are kept as images."""
-    arguments = {"root": str(root), "num_scans": 4, "sensor": {"beams": 16, "columns": 64}}
+    """Data YAML of two simulated scans that are kept as images."""
+    arguments = {"root": str(root), "num_scans": 2, "sensor": {"beams": 16, "columns": 64}}
     arguments |= {"codec": codec, "grid_size": [2, 8], "extractor": GEOMETRIC}
     path = root.parent / f"{root.name}.yaml"
     name = "r3dpa.data.SimulatedImageDataModule"
@@ -191,11 +191,11 @@ def test_labelled_images_give_the_grids_that_a_training_would_make(tmp_path, cap
         config = cached_images(tmp_path / name, codec)
         if name == "extracted":
             features("--data", config, "--data.init_args.batch_size", 3)
-            assert "4 made, 0 kept" in capsys.readouterr().out
+            assert "2 made, 0 kept" in capsys.readouterr().out
         main(["prepare", "--config", str(config)])
         (file,) = (tmp_path / name / "feature_grids").rglob("*.rows")
         grids.append(file.read_bytes())
-    assert len(grids[0]) == 4 * ROW
+    assert len(grids[0]) == 2 * ROW
     assert grids[0] == grids[1]
 
 

@@ -5,15 +5,20 @@ All through the real command line, and all before a step is taken: no checkpoint
 
 from __future__ import annotations
 
+import re
 from functools import partial
 
 import lightning as L
 import numpy as np
 import pytest
 import torch
-from tiny_stages import SILENT, TinyData, stage_module, tiny_sit, train
+from tiny_stages import FEATURE_DIM, SENSOR, SILENT, TinyData, stage_module, tiny_sit, train
 
 from r3dpa.cli import main
+from r3dpa.data import SimulatedDataModule
+from r3dpa.features import GeometricFeatures
+from r3dpa.geometry import RangeCodec
+from r3dpa.modules import OptimizerConfig
 
 SIT = "model.init_args.sit.init_args"
 pytestmark = pytest.mark.filterwarnings("ignore:LightningCLI's args parameter")
@@ -74,11 +79,6 @@ def test_an_option_or_key_that_cannot_be_is_named(option, named, tmp_path, refus
     assert named in capsys.readouterr().err.split("error:")[-1]
 
 
-def test_images_and_latents_that_do_not_fit(own_scans, refused):
-    message = refused("joint", *data_args(own_scans), f"--{SIT}.input_size=[4, 8]")
-    assert "(16, 64) pixels give (4, 16) latents, but the SiT has input_size (4, 8)" in message
-
-
 @pytest.mark.filterwarnings("ignore:Attribute '.*' is an instance of `nn.Module`")
 @pytest.mark.parametrize(
     ("data", "sit", "message"),
@@ -101,31 +101,55 @@ def test_networks_and_data_that_do_not_fit(data, sit, message):
     [
         ("--trainer.precision=64-true", "--trainer.precision 64-true is not supported"),
         (
-            "--trainer.max_steps=-1 --model.init_args.optimizer.decay_steps=2",
-            "optimizer.decay_steps and optimizer.cosine need the last step",
+            f"--{SIT}.input_size=[4,8]",
+            "(16, 64) pixels give (4, 16) latents, but the SiT has input_size (4, 8)",
         ),
-        (f"--{SIT}.in_channels=8", "has in_channels 8, but the VAE has 4 latent channels"),
-        (f"--{SIT}.input_size=[4,8]", "but the SiT has input_size (4, 8)"),
-        ("--data.init_args.codec.return_channel=true", "the VAE is for images with"),
-        ("--data.init_args.grid_size=[4,32]", "set --data.init_args.grid_size to the latter"),
-        (
-            "--data.init_args.grid_size=[3,16]",
-            "set --data.init_args.grid_size, or beams and columns of --data.init_args.sensor",
-        ),
-        (f"--{SIT}.feature_dim=20", "features have width"),
     ],
 )
 def test_a_mistake_is_reported_before_scans_are_simulated(words, message, tmp_path, refused):
     root = f"--data.init_args.root={tmp_path / 'scans'}"
-    assert message in refused("joint", root, *words.split())
+    assert message in refused("joint", root, words)
     assert not (tmp_path / "scans").exists()
 
 
-def test_rings_are_checked_before_their_inclinations_are_known(tmp_path, refused):
-    more = ["--data.init_args.projection=rings", "--data.init_args.grid_size=[4,32]"]
-    message = refused("joint", f"--data.init_args.root={tmp_path / 'scans'}", *more)
-    assert "set --data.init_args.grid_size to the latter" in message
-    assert not (tmp_path / "scans").exists()
+SIZES = {"sensor": SENSOR, "grid_size": (2, 4), "extractor": GeometricFeatures(dim=FEATURE_DIM)}
+DECAYING = {"optimizer": OptimizerConfig(decay_steps=2)}
+TO_THE_LATTER = "set --data.init_args.grid_size to the latter"
+
+
+@pytest.mark.filterwarnings("ignore:Attribute '.*' is an instance of `nn.Module`")
+@pytest.mark.parametrize(
+    ("data", "sit", "module", "message"),
+    [
+        ({}, {}, DECAYING, "optimizer.decay_steps and optimizer.cosine need the last step"),
+        ({}, {"in_channels": 8}, {}, "has in_channels 8, but the VAE has 4 latent channels"),
+        ({}, {"feature_dim": 20}, {}, "features have width 6"),
+        ({"codec": RangeCodec(return_channel=True)}, {}, {}, "the VAE is for images with"),
+        ({"grid_size": (4, 8)}, {}, {}, TO_THE_LATTER),
+        # Their inclinations are not known yet.
+        ({"projection": "rings", "grid_size": (4, 8)}, {}, {}, TO_THE_LATTER),
+        (
+            {"grid_size": (3, 16)},
+            {},
+            {},
+            "set --data.init_args.grid_size, or beams and columns of --data.init_args.sensor",
+        ),
+    ],
+)
+def test_checks_that_need_no_scan(data, sit, module, message, tmp_path):
+    """Called before data are prepared, as the test above shows."""
+    scans = SimulatedDataModule(str(tmp_path / "scans"), **SIZES | data)
+    stage = stage_module("joint", partial(tiny_sit, **sit), **module)
+    trainer = L.Trainer(**SILENT, max_steps=-1)
+    with pytest.raises(ValueError, match=re.escape(message)):
+        stage.check_before_data(trainer, scans, None)
+
+
+def test_settings_that_fit_pass_the_checks(tmp_path):
+    scans = SimulatedDataModule(str(tmp_path / "scans"), **SIZES)
+    stage_module("joint", **DECAYING).check_before_data(
+        L.Trainer(**SILENT, max_steps=9), scans, None
+    )
 
 
 def test_a_fit_in_python_is_told_to_give_a_datamodule():

@@ -25,11 +25,9 @@ SAMPLER = SamplerConfig("euler", 3)
 
 
 @pytest.fixture(scope="module")
-def flow(smoke_root, tmp_path_factory):
+def flow(baseline_once):
     """Checkpoint of a 1-rectified flow."""
-    run_dir = tmp_path_factory.mktemp("flow")
-    main(fit_words("fit", "r2flow", smoke_root, run_dir))
-    return run_dir / "checkpoints" / "last.ckpt"
+    return baseline_once("r2flow")
 
 
 @pytest.fixture(scope="module")

@@ -52,14 +52,14 @@ def fit(run_dir, configs, *settings, **more):
 
 
 def steps(number):
-    every = {"trainer.val_check_interval": number, "checkpoint.every_n_train_steps": 2}
+    every = {"trainer.val_check_interval": number, "checkpoint.every_n_train_steps": 1}
     return {"trainer.max_steps": number, "checkpoint.save_top_k": -1, **every}
 
 
 @pytest.fixture(scope="module")
 def image_vae(tmp_path_factory):
     configs = ["trainer", "demo/trainer", "data/dead_leaves", "experiment/image_vae"]
-    return fit(tmp_path_factory.mktemp("image_vae"), configs, LEAVES, VAE, steps(2))
+    return fit(tmp_path_factory.mktemp("image_vae"), configs, LEAVES, VAE, steps(1))
 
 
 DEMO = ("trainer", "demo/trainer", "data/dead_leaves")
@@ -70,7 +70,7 @@ RGB = (*DEMO, "experiment/rgb_pretraining", "demo/rgb_pretraining")
 def rgb(image_vae, tmp_path_factory):
     run_dir = tmp_path_factory.mktemp("rgb")
     start = {"model.init_args.init_from": image_vae}
-    return fit(run_dir, RGB, LEAVES, VAE, TINY, steps(4), start)
+    return fit(run_dir, RGB, LEAVES, VAE, TINY, steps(2), start)
 
 
 def test_the_vae_is_frozen_and_the_sit_trained_and_resumed_exactly(image_vae, rgb, tmp_path):
@@ -87,8 +87,8 @@ def test_the_vae_is_frozen_and_the_sit_trained_and_resumed_exactly(image_vae, rg
     sit = [key for key in after if key.startswith("sit.") and key != "sit.pos_embed"]
     assert len(group["params"]) == len(sit) - len(projector)
     start = {"model.init_args.init_from": image_vae}
-    start["ckpt_path"] = rgb.with_name("step=0000002.ckpt")
-    resumed = torch.load(fit(tmp_path, RGB, LEAVES, VAE, TINY, steps(4), start), weights_only=True)
+    start["ckpt_path"] = rgb.with_name("step=0000001.ckpt")
+    resumed = torch.load(fit(tmp_path, RGB, LEAVES, VAE, TINY, steps(2), start), weights_only=True)
     assert after.keys() == resumed["state_dict"].keys()
     for key, value in after.items():
         assert torch.equal(value, resumed["state_dict"][key]), key
@@ -144,7 +144,7 @@ def test_images_of_a_folder_are_aligned_with_a_teacher(image_vae, tmp_path):
     }
     start = {"model.init_args.init_from": image_vae}
     configs = ("trainer", "data/images", "experiment/rgb_pretraining")
-    settings = (folder, VAE, TINY, teacher, steps(2), start)
+    settings = (folder, VAE, TINY, teacher, steps(1), start)
     with pytest.raises(ValueError, match=r"random weights: give .*teacher\.init_args\.weights"):
         fit(tmp_path / "run", configs, *settings)
     weights = {"model.init_args.teacher.init_args.weights": tmp_path / "dino.pth"}
@@ -168,11 +168,19 @@ def test_a_teacher_is_moved_to_the_images():
     assert features.device.type == "meta"
 
 
+def test_a_teacher_and_its_weight_go_together():
+    sit = SiT(
+        input_size=(8, 8), hidden_size=16, depth=1, num_heads=2, alignment_depth=1, feature_dim=16
+    )
+    vae = ImageVAE(sit.in_channels, channels=(8, 16), norm_groups=4)
+    with pytest.raises(ValueError, match="go together"):
+        RGBPretraining(vae, sit, weights=LossWeights(sit_alignment=0.5))
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
         ({}, "give --model.init_args.init_from a checkpoint of stage image_vae"),
-        ({"model.init_args.weights.sit_alignment": 0.5}, "go together"),
         ({"data.init_args.image_size": 32}, r"give \(16, 16\) latents"),
     ],
 )

@@ -1,8 +1,10 @@
 """``r3dpa fit | validate`` with stages other than those of range images; presets, wandb."""
 
 import csv
+import io
 import re
 import warnings
+from contextlib import chdir, redirect_stdout
 from pathlib import Path
 
 import pytest
@@ -20,6 +22,7 @@ from r3dpa.features import feature_source
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 BORING = "lightning.pytorch.demos.boring_classes"
+WEIGHTS = "model.init_args.weights"
 
 
 class LoggingModel(BoringModel):
@@ -67,24 +70,30 @@ def test_any_lightning_module_is_trained_resumed_and_evaluated(tmp_path, capsys)
         main(["validate", *arguments])
 
 
-def test_one_batch_is_no_share_of_all(capsys):
+@pytest.fixture(scope="module")
+def printed_demo(tmp_path_factory):
+    """Configuration of a command line in a folder without configurations, as it is printed."""
+    words = "--trainer.limit_val_batches 1 --trainer.limit_train_batches 1.0 --trainer.max_steps 7 "
+    words += f"--{WEIGHTS}.adversarial_ratio null --{WEIGHTS}.alignment_release 0.02 "
+    words += f"--{WEIGHTS}.alignment_release None"
+    shown = io.StringIO()
+    folder = tmp_path_factory.mktemp("elsewhere")
+    with chdir(folder), redirect_stdout(shown), pytest.raises(SystemExit):
+        main(["fit", "joint", "--preset", "demo", *words.split(), "--print_config"])
+    return shown.getvalue()
+
+
+def test_one_batch_is_no_share_of_all(printed_demo):
     """Lightning takes 1 as a number of batches, and 1.0 as all of them."""
-    words = ["--trainer.limit_val_batches", "1", "--trainer.limit_train_batches", "1.0"]
-    with pytest.raises(SystemExit):
-        main(["fit", "joint", "--preset", "demo", *words, "--print_config"])
-    shown = capsys.readouterr().out
-    assert "\n  limit_val_batches: 1\n" in shown
-    assert "\n  limit_train_batches: 1.0\n" in shown
+    assert "\n  limit_val_batches: 1\n" in printed_demo
+    assert "\n  limit_train_batches: 1.0\n" in printed_demo
 
 
-@pytest.mark.parametrize("word", ["null", "None"])
-def test_a_nested_value_is_unset_from_the_command_line(word, capsys):
+def test_nested_values_are_unset_from_the_command_line(printed_demo):
     """jsonargparse hands null on as the text None, which is no number."""
-    option = "--model.init_args.weights.adversarial_ratio"
-    with pytest.raises(SystemExit):
-        main(["fit", "joint", "--preset", "demo", option, word, "--print_config"])
-    config = yaml.safe_load(capsys.readouterr().out)
-    assert config["model"]["init_args"]["weights"]["adversarial_ratio"] is None
+    weights = yaml.safe_load(printed_demo)["model"]["init_args"]["weights"]
+    assert weights["adversarial_ratio"] is None
+    assert weights["alignment_release"] is None
 
 
 def test_a_stage_of_range_images_needs_batches_of_them(smoke_args, tmp_path):
@@ -117,11 +126,8 @@ def test_a_class_that_is_none_or_of_the_wrong_kind_is_named(model, data, message
     assert re.match(message, line)
 
 
-def test_presets_are_the_shipped_configurations(capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit):
-        main(["fit", "joint", "--preset", "demo", "--trainer.max_steps", "7", "--print_config"])
-    config = yaml.safe_load(capsys.readouterr().out)
+def test_presets_are_the_shipped_configurations(printed_demo):
+    config = yaml.safe_load(printed_demo)
     assert config["model"]["class_path"] == "r3dpa.modules.JointAlignment"
     assert config["model"]["init_args"]["sit"]["init_args"]["hidden_size"] == 192
     assert config["data"]["init_args"]["root"] == "runs/demo/data"
@@ -238,7 +244,7 @@ def trained(configs, settings, run_dir, *more):
     return torch.load(run_dir / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
 
 
-@pytest.mark.parametrize("train", [trained_teacher, trained_with_classes, trained_judge])
+@pytest.mark.parametrize("train", [trained_teacher, trained_with_classes])
 def test_the_point_teacher_trains_resumes_exactly_and_gives_a_source(train, roots, tmp_path):
     whole = train(roots, tmp_path / "whole")
     middle = tmp_path / "whole" / "checkpoints" / "step=0000001.ckpt"
@@ -246,14 +252,25 @@ def test_the_point_teacher_trains_resumes_exactly_and_gives_a_source(train, root
     for key, value in whole.items():
         # Without targets of geometry, their quantiles stay NaN.
         torch.testing.assert_close(resumed[key], value, rtol=0, atol=0, equal_nan=True, msg=key)
-    (weights,) = (tmp_path / "rest").glob("*.safetensors")
+    kind = torch.float16 if train is trained_with_classes else torch.float32
+    assert_gives_a_source(tmp_path / "rest", kind)
+
+
+def test_the_judge_trains_and_gives_a_source(roots, tmp_path):
+    """It is of the class of the first teacher, on the images of the second."""
+    trained_judge(roots, tmp_path, "--trainer.max_steps=1")
+    assert_gives_a_source(tmp_path, torch.float32)
+
+
+def assert_gives_a_source(run_dir, kind):
+    (weights,) = run_dir.glob("*.safetensors")
     name = weights.stem.replace("_", "-")
     features = feature_source(name, weights, dim=16)(torch.rand(50, 4) * 10)
     assert features.shape == (50, 16)
     assert torch.allclose(features.norm(dim=1), torch.ones(50), atol=1e-5)
     with safe_open(weights, "pt") as file:
         kinds = {file.get_tensor(key).dtype for key in file.keys()} - {torch.int64}  # noqa: SIM118
-    assert kinds == {torch.float16 if train is trained_with_classes else torch.float32}
+    assert kinds == {kind}
 
 
 def test_one_command_simulates_then_adds_scans_and_the_grids_of_a_teacher(tmp_path, capsys):

@@ -233,8 +233,12 @@ def test_a_message_names_the_option_as_it_is_typed(words, message, capsys):
 
 def test_absent_weights_of_an_extractor_are_named_in_one_line(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    narrow = ["--model.init_args.vae.init_args.channels=32"]
+    narrow += [
+        f"--model.init_args.sit.init_args.{size}" for size in ("hidden_size=48", "num_heads=2")
+    ]
     with pytest.raises(ValueError, match=r"^data/weights/scalr\.pth: no such file; give ckpt_last"):
-        main(["fit", "joint", "--preset", "kitti360_paper", "--dry_run"])
+        main(["fit", "joint", "--preset", "kitti360_paper", "--dry_run", *narrow])
 
 
 @pytest.mark.parametrize(
