@@ -142,11 +142,13 @@ endif
 MINUTES ?= 10
 SENSOR ?= $(MINE)/sensor.yaml
 MINE := runs/my_sensor
+ESTIMATED := $(filter file,$(origin SENSOR))
 MY_FIT := $(BIN)/r3dpa fit --config conf/trainer.yaml --config conf/r3dpa_s/trainer.yaml \
 	--config '$(MINE)/data.yaml'
 my-sensor: $(READY) ## r3dpa-s in the geometry of your sensor: make my-sensor DATA=folder of scans [MINUTES=60]
+	$(if $(ESTIMATED),,$(if $(filter $(MINE)/%,$(SENSOR)),$(error $(MINE) is made anew: copy $(SENSOR) out of it)))
 	rm -rf '$(MINE)'
-	$(BIN)/r3dpa data sensor '$(DATA)' --out '$(MINE)/sensor.yaml'
+	$(if $(ESTIMATED),$(BIN)/r3dpa data sensor '$(DATA)' --out '$(SENSOR)')
 	$(BIN)/r3dpa data plan '$(SENSOR)' --scans '$(DATA)' --out '$(MINE)' --minutes $(MINUTES)
 	$(BIN)/r3dpa data simulate --out '$(MINE)/simulated' --config '$(MINE)/simulate.yaml'
 	$(MY_FIT) --config conf/r3dpa_s/vae_alignment.yaml --config conf/r3dpa_s/demo_vae.yaml \

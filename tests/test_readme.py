@@ -69,3 +69,8 @@ def test_links_and_paths_of_documents_exist(name):
         for path in re.findall(r"`([\w.]+/[\w./]*)`", text):
             built = path.startswith("build/")
             assert built or any((root / path).exists() for root in roots), path
+
+
+def test_another_seed_changes_the_first_weights_too():
+    keys = ("seed_everything", "model.init_args.seed", "data.init_args.seed")
+    assert " ".join(f"--{key} 1" for key in keys) in README.read_text()

@@ -5,9 +5,11 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from r3dpa.bench import dry_run as dry_run_module
 from r3dpa.bench.dry_run import DryRun, batch_lines
-from r3dpa.bench.training import StageCost
+from r3dpa.bench.training import StageCost, StepSettings
 from r3dpa.cli import main, stages
+from r3dpa.data import LidarDataModule
 
 
 def dry_run(words, capsys):
@@ -108,3 +110,15 @@ def test_a_dry_run_is_of_a_fit(capsys):
     with pytest.raises(SystemExit):
         main(["validate", "joint", "--dry_run"])
     assert "--dry_run is an option of r3dpa fit" in capsys.readouterr().err
+
+
+def test_a_dry_run_sees_scans_as_the_sensor_of_the_run(monkeypatch):
+    """A checkpoint to start from is compared with them."""
+    measured = []
+    monkeypatch.setattr(
+        dry_run_module, "measure_steps", lambda _, data, *a, **k: measured.append(data)
+    )
+    data = LidarDataModule("scans", sensor="vlp16", image_columns=64)
+    module = SimpleNamespace(sit=SimpleNamespace(feature_dim=16))
+    DryRun(module, data, None)._measure(StepSettings())
+    assert measured[0].known_projection == data.known_projection

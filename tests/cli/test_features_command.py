@@ -260,3 +260,18 @@ class TestNamedColumns:
         with pytest.raises(SystemExit):
             main(["fit", "vae_alignment", "--columns", self.NAMES])
         assert "unknown option --data.init_args.columns" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["prepare", "features"])
+def test_configurations_of_the_package_are_found_anywhere(command, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        main(["data", command, "--config", "conf/data/demo.yaml", "--print_config"])
+    assert ended.value.code == 0
+    assert "SimulatedDataModule" in capsys.readouterr().out
+
+
+def test_what_lightning_says_of_its_options_is_one_line(tmp_path):
+    words = ["--data", str(tmp_path), "--extractor", "geometric"]
+    with pytest.raises(ValueError, match="limit_predict_batches"):
+        main(["data", "features", *words, "--trainer.limit_predict_batches", "1.5"])

@@ -11,13 +11,15 @@ import pytest
 import torch
 import wandb
 import yaml
+from jsonargparse import Namespace
 from lightning.pytorch.demos.boring_classes import BoringModel
+from lightning.pytorch.utilities import rank_zero_only
 from safetensors import safe_open
 
 from r3dpa.cli import main
 from r3dpa.cli.features import with_data_class
 from r3dpa.cli.presets import conf_folder
-from r3dpa.cli.stages import ignore_harmless_notices
+from r3dpa.cli.stages import StageCLI, _newest, ignore_harmless_notices
 from r3dpa.features import feature_source
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
@@ -57,6 +59,8 @@ def test_any_lightning_module_is_trained_resumed_and_evaluated(tmp_path, capsys)
     assert torch.load(last, weights_only=True)["global_step"] == 2
     main(["fit", *arguments, "--trainer.max_steps=4", "--ckpt_path", str(last)])
     assert torch.load(last, weights_only=True)["global_step"] == 4
+    # A run with this configuration is a new one.
+    assert yaml.safe_load((tmp_path / "config.yaml").read_text())["ckpt_path"] is None
     capsys.readouterr()
     main(["validate", *arguments, "--ckpt_path", str(last)])
     assert "held_out_loss" in capsys.readouterr().out
@@ -184,6 +188,40 @@ def test_evaluation_joins_the_wandb_run_of_the_training(tmp_path):
     folders = [path.name for path in run_dir.glob("wandb/offline-run-*")]
     assert folders  # two that begin within one second differ in a number at the end
     assert all(f"-{run_id}" in name for name in folders)
+    # A run with this configuration has a wandb run of its own.
+    logger = yaml.safe_load((run_dir / "config.yaml").read_text())["trainer"]["logger"]
+    names = ("id", "name", "group", "job_type")
+    assert [logger["init_args"][name] for name in names] == [None] * 4
+
+
+def test_the_first_process_names_the_wandb_run(tmp_path, monkeypatch):
+    cli = object.__new__(StageCLI)
+    cli.subcommand = "fit"
+    cli.config = Namespace(fit=Namespace(run_dir=str(tmp_path), model=None))
+    for rank, names_it in ((1, False), (0, True)):
+        monkeypatch.setattr(rank_zero_only, "rank", rank)
+        cli._name_wandb_run({}, tmp_path)
+        assert (tmp_path / "wandb_id.txt").exists() == names_it
+
+
+def test_what_lightning_says_of_its_options_is_one_line(tmp_path):
+    arguments = words(f"{__name__}.LoggingModel", f"{BORING}.BoringDataModule", tmp_path)
+    with pytest.raises(ValueError, match="limit_train_batches") as raised:
+        main(["fit", *arguments, "--trainer.limit_train_batches=1.5"])
+    assert len(str(raised.value).splitlines()) == 1
+
+
+def test_last_of_a_copied_run_has_most_steps(joint_run, tmp_path):
+    """Its files may have the times of copying."""
+    folder = tmp_path / "checkpoints"
+    folder.mkdir()
+    assert _newest(tmp_path) is None
+    content = torch.load(joint_run / "checkpoints" / "last.ckpt", weights_only=True)
+    for name, step in (("last", 4), ("step=0000003", 3)):
+        torch.save(content | {"global_step": step}, folder / f"{name}.ckpt")
+    assert _newest(tmp_path) == str(folder / "last.ckpt")
+    torch.save(content | {"global_step": 5}, folder / "step=0000005.ckpt")
+    assert _newest(tmp_path) == str(folder / "step=0000005.ckpt")
 
 
 SIMULATED = {

@@ -4,6 +4,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from threading import Event
 
+import numpy as np
 import pytest
 import torch
 
@@ -277,3 +278,14 @@ def test_other_settings_are_refused_when_writing(made, projection, scaled_points
     assert any_settings(root).extractor["name"] == "scaled"
     with pytest.raises(StoreError, match=r"no feature grids in .*r3dpa data features"):
         any_settings(root / "nothing")
+
+
+def test_grids_of_scans_with_named_columns(tmp_path, projection, scaled_points):
+    rows = np.random.default_rng(0).uniform(0.1, 0.9, (2, 400, 5)).astype("<f4")
+    (tmp_path / "scans").mkdir()
+    for number, scan in enumerate(rows * [30, 30, 1, 1, 1]):
+        scan.astype("<f4").tofile(tmp_path / "scans" / f"{number}.bin")
+    scans = find_scans(tmp_path / "scans", ("x", "y", "z", "intensity", "ring"))
+    write_feature_grids(scans, scaled_points(), projection, [GRID], tmp_path / "grids")
+    grids = FeatureGrids(tmp_path / "grids", scans, projection, GRID, scaled_points())
+    assert grids.read(scans[0]).any()

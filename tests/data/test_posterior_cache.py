@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from types import SimpleNamespace
 
 import pytest
 import torch
 from tiny_stages import TinyData, stage_module
 
-from r3dpa.data.posterior_cache import cache_posteriors
+from r3dpa.data.posterior_cache import cache_posteriors, fill_cache
+from r3dpa.data.store import StoreError, tensor_cache
 from r3dpa.modules import FlowMatching, flow_matching
 
 
@@ -80,3 +82,28 @@ def test_posteriors_of_scans_depend_on_projection_and_codec(monkeypatch, tmp_pat
     ((_, settings, *_),) = found
     geometry = TinyData.geometry.to_dict()
     assert settings == {"projection": geometry["projection"], "codec": geometry["codec"]}
+
+
+def test_processes_make_all_that_another_job_does_not(tmp_path):
+    """It adds an item between the looks of two processes, which then see different ones missing."""
+    cache, given = tensor_cache(tmp_path, "numbers", {}, (1,)), items()
+
+    def rows(some):
+        yield from (torch.tensor([[float(item.name)]]) for item in some)
+
+    def fill(rank, at_barrier):
+        loaders = SimpleNamespace(prepare_data_per_node=False)
+        strategy = SimpleNamespace(barrier=lambda _: next(at_barrier, lambda: None)())
+        trainer = SimpleNamespace(
+            datamodule=loaders, strategy=strategy, global_rank=rank, world_size=2
+        )
+        return fill_cache(trainer, cache, given, rows)
+
+    def second_process():
+        with cache.writer(9) as writer:  # the other job
+            writer.add([given[0].cache_key], torch.zeros(1, 1))
+        with suppress(StoreError):  # where it is called before the first has written
+            fill(1, iter(()))
+
+    fill(0, iter([second_process]))
+    assert not cache.missing(given)

@@ -17,6 +17,7 @@ from tqdm import tqdm
 
 from r3dpa.data import Scan
 from r3dpa.data.datamodules import LidarDataModule
+from r3dpa.data.scans import find_scans
 from r3dpa.feature_names import DEFAULT_SPACES
 from r3dpa.generation import SamplerConfig
 from r3dpa.geometry import points_of
@@ -58,8 +59,9 @@ class SceneScorer(L.Callback):
         precision: Precision of the networks that sample.
         seed: Seed of the scenes, see :class:`SceneGenerator`.
         reference: File of ``r3dpa data reference``, or R3DPA's own ``data_statistics.npy``. Without
-            it, all scans of the data module are the reference, training and held-out; their
-            statistics are computed once and kept in ``<run_dir>/evaluation/reference.safetensors``.
+            it, all ``scans`` of the data module are the reference, training and held-out, but not
+            ``further_scans``; their statistics are computed once and kept in
+            ``<run_dir>/evaluation/reference.safetensors``.
         split: Split of ``data_statistics.npy``; default: ``val``, if it holds both.
         spaces: Feature spaces; default: all of the reference file that need no weights or have
             them in ``ckpt``; without a reference file ``fwid``, ``fgeo`` and those in ``ckpt``.
@@ -114,7 +116,9 @@ class SceneScorer(L.Callback):
                     f"scorer.reference: {type(datamodule).__name__} does not list its scans: give "
                     "a file of `r3dpa data reference`, or --scorer.num_scenes 0 to score no scenes"
                 )
-            scans = datamodule.all_set.scans
+            further = datamodule.further_scans  # such as simulated ones: no reference
+            left_out = set(find_scans(further)) if further else set()
+            scans = [scan for scan in datamodule.all_set.scans if scan not in left_out]
             setting = replace(PROTOCOLS[self.protocol or "default"], sensor=datamodule.sensor)
             names = tuple(dict.fromkeys((*DEFAULT_SPACES, *self.ckpt)))
             spaces = feature_spaces(self.spaces or names, self.ckpt, setting, device)

@@ -11,8 +11,8 @@ from pathlib import Path
 
 from lightning import Trainer
 
-from r3dpa.cli.presets import shipped
-from r3dpa.cli.stages import StageParser, ignore_harmless_notices
+from r3dpa.cli.presets import find_configs, shipped
+from r3dpa.cli.stages import StageParser, ignore_harmless_notices, options_of_lightning
 from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.feature_names import SOURCES
 from r3dpa.features.scalr import feature_source
@@ -25,13 +25,14 @@ def features(args: list[str]) -> None:
     """Run the command, given its name and the words after it."""
     ignore_harmless_notices()
     parser = features_parser("r3dpa data features")
-    config = parser.parse_args(with_data_class(args[1:]))
+    config = parser.parse_args(with_data_class(find_configs(args[1:])))
     if config.extractor or config.ckpt:
         config.data.init_args.extractor = feature_source(config.extractor or "scalr", config.ckpt)
     if config.out:
         config.data.init_args.features_dir = str(config.out)
     objects = parser.instantiate(config)
-    trainer = Trainer(**objects.trainer, logger=False, enable_checkpointing=False)
+    with options_of_lightning():
+        trainer = Trainer(**objects.trainer, logger=False, enable_checkpointing=False)
     check_trainer(trainer)
     data: LidarDataModule = objects.data
     if data.extractor is None or data.features_dir is None:
@@ -53,7 +54,7 @@ def prepare(args: list[str]) -> None:
     )
     parser.add_argument("--config", action="config", help="data YAML; later ones win")
     parser.add_lightning_class_args(LidarDataModule, "data", subclass_mode=True)
-    data: LidarDataModule = parser.instantiate(parser.parse_args(args[1:])).data
+    data: LidarDataModule = parser.instantiate(parser.parse_args(find_configs(args[1:]))).data
     data.prepare_data()
     train, val = data.limited_split()
     grids = (

@@ -7,8 +7,8 @@ import os
 import sys
 import uuid
 import warnings
-from collections.abc import Sequence
-from contextlib import nullcontext
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -20,6 +20,7 @@ from lightning.pytorch.callbacks import TQDMProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 from lightning.pytorch.loggers import Logger, WandbLogger
 from lightning.pytorch.utilities import rank_zero_info, rank_zero_only
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from r3dpa.bench.dry_run import DryRun, batch_lines
 from r3dpa.callbacks import RunCheckpoint, SceneScorer
@@ -46,6 +47,7 @@ _HARMLESS = (
 )
 
 
+_WANDB_ID = "wandb_id.txt"
 _TRAIN = "train/"  # in front of the names of losses
 _NOTICES = ("GPU available: False", "TPU available:", "HPU available:", "💡 Tip:", "Seed set to")
 _NOTICE_LOGGERS = ("lightning.pytorch.utilities.rank_zero", "lightning.fabric.utilities.seed")
@@ -148,7 +150,15 @@ class _RecordConfig(SaveConfigCallback):
 
     def save_config(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Write the configuration; not to ``trainer.log_dir``, which would need all processes."""
-        text = self.parser.dump(self.config, skip_unset=False, skip_validation=True)
+        config = self.config.clone()
+        config.ckpt_path = None  # a run with this file is a new one, with a wandb run of its own
+        loggers = config.trainer.logger
+        for logger in loggers if isinstance(loggers, list) else [loggers]:
+            arguments: Any = getattr(logger, "init_args", {})
+            for key, value in wandb_names(config).items():
+                if arguments.get(key) == value:
+                    arguments[key] = None
+        text = self.parser.dump(config, skip_unset=False, skip_validation=True)
         write_text(Path(trainer.default_root_dir) / self.config_filename, text)
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -355,20 +365,26 @@ class StageCLI(LightningCLI):
 
     def _name_wandb_run(self, init_args: Any, run_dir: Path) -> None:
         """Fill what the configuration leaves open; `test` and a resumed `fit` join the run."""
-        model, note = self.config[self.subcommand].get("model"), run_dir / "wandb_id.txt"
-        if self.subcommand == "fit" and not note.exists():
+        note, first = run_dir / _WANDB_ID, cast(Any, rank_zero_only).rank == 0
+        if self.subcommand == "fit" and first and not note.exists():
             write_text(note, uuid.uuid4().hex[:8])
-        names = {
-            "name": "/".join(run_dir.parts[-2:]),
-            "group": run_dir.resolve().parent.name,
-            "job_type": model.class_path.rpartition(".")[2] if model else None,
-            "id": note.read_text(encoding="utf-8") if note.exists() else None,
-        }
-        for key, value in names.items():
+        for key, value in wandb_names(self.config[self.subcommand]).items():
             if init_args.get(key) is None:
                 init_args[key] = value
         if init_args.get("offline"):  # nothing to look at on the web
             os.environ.setdefault("WANDB_SILENT", "true")
+
+
+def wandb_names(config: Any) -> dict[str, str | None]:
+    """Name, group, type and id of the wandb run of a configuration, by its ``run_dir``."""
+    run_dir, model = Path(config.run_dir), config.get("model")
+    note = run_dir / _WANDB_ID
+    return {
+        "name": "/".join(run_dir.parts[-2:]),
+        "group": run_dir.resolve().parent.name,
+        "job_type": model.class_path.rpartition(".")[2] if model else None,
+        "id": note.read_text(encoding="utf-8") if note.exists() else None,
+    }
 
 
 def _runs_without_bfloat16(trainer: Any) -> bool:
@@ -380,9 +396,14 @@ def _runs_without_bfloat16(trainer: Any) -> bool:
 
 def _newest(run_dir: Path) -> str | None:
     """Newest checkpoint of a run, if it has one."""
-    checkpoints = (run_dir / "checkpoints").glob("[!.]*.ckpt")
+    last = run_dir / "checkpoints" / "last.ckpt"
+    checkpoints = last.parent.glob("[!.]*.ckpt")
     newest = max(checkpoints, key=lambda path: path.stat().st_mtime_ns, default=None)
-    return None if newest is None else str(newest)
+    if newest is None:
+        return None
+    if newest != last and last.exists():  # a copied folder may have the times of copying
+        newest = max(last, newest, key=lambda path: read_checkpoint(path).step)
+    return str(newest)
 
 
 def run(args: list[str]) -> None:
@@ -393,4 +414,16 @@ def run(args: list[str]) -> None:
     ignore_harmless_notices()
     words, preset = expand_preset([word for word in args[1:] if word != "--dry_run"])
     dry_run = "--dry_run" in args
-    StageCLI([args[0], *find_configs(words)], preset, dry_run=dry_run)
+    with options_of_lightning():
+        StageCLI([args[0], *find_configs(words)], preset, dry_run=dry_run)
+
+
+@contextmanager
+def options_of_lightning() -> Iterator[None]:
+    """Turn what Lightning says of its options into a line for the user."""
+    try:
+        yield
+    except MisconfigurationException as error:
+        if getattr(error, "during_training", False):
+            raise
+        raise ValueError(" ".join(str(error).split())) from None

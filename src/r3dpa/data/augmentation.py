@@ -42,7 +42,8 @@ class View:
         """Reordered image ``(..., W)``, W a multiple of w.
 
         Equals projecting the transformed points, but for those at the border of two pixels: a pixel
-        holds its left border only, which mirroring makes the right one.
+        holds its left border only, which mirroring makes the right one. Beams beside the axis
+        (``lateral_m`` of a BeamProjection) keep their side: mirrored, they are off by twice that.
         """
         return self._reordered(image, -1, image.shape[-1] // self.grid_columns)
 

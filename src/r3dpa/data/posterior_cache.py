@@ -73,15 +73,15 @@ def fill_cache(
     Returns:
         Reader of the complete cache.
     """
-    missing = cache.missing(items)
-    trainer.strategy.barrier("cached tensors: all have looked")
+    # Shares of all items: another job may fill the cache while the processes look for missing ones.
     # Where each node has a disk of its own, its processes make everything.
     if trainer.datamodule.prepare_data_per_node:
-        share = missing[trainer.local_rank :: trainer.num_devices]
+        share = items[trainer.local_rank :: trainer.num_devices]
     else:
-        share = missing[trainer.global_rank :: trainer.world_size]
+        share = items[trainer.global_rank :: trainer.world_size]
+    of_share, share = len(share), cache.missing(share)
     if share:
-        rank_zero_info(f"making {len(missing)} of {len(items)} once, into {cache.folder}")
+        rank_zero_info(f"making {len(share)} of {of_share} once, into {cache.folder}")
         keys = [item.cache_key for item in share]
         num_done = 0
         with cache.writer(trainer.global_rank) as writer:

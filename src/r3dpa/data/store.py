@@ -262,7 +262,7 @@ class CachedTensors(Generic[Item]):
 
     def __init__(self, store: Store, items: Sequence[Item]) -> None:
         self.store, self.items = store, list(items)
-        names = {item.name: item for item in items}
+        names = {item.cache_key[0]: item for item in items}
         self._places = {key: at for key, at in store.places().items() if key[0] in names}
         self._files: dict[int, int] = {}  # descriptor by shard
         if missing := names.keys() - {key[0] for key in self._places}:

@@ -390,12 +390,25 @@ class Stage(L.LightningModule, ABC):
         self.loaded_step = checkpoint.get("global_step", 0)
         facts = checkpoint.get("r3dpa", {})
         self._check_stage(facts.get("stage"))
+        if "geometry" in facts:
+            self._check_geometry(ScanGeometry.from_dict(facts["geometry"]), "the checkpoint")
+        if "state_dict" in checkpoint:
+            self._check_networks(checkpoint["state_dict"])
         self.residuals = ResidualAverages(**checkpoint.get("alignment_residuals", {}))
         for state in checkpoint.get("optimizer_states", []):
             for group in state["param_groups"]:
                 group.update(self.optimizer_config.adamw())
-        if "geometry" in facts:
-            self._check_geometry(ScanGeometry.from_dict(facts["geometry"]), "the checkpoint")
+
+    def _check_networks(self, theirs: Mapping[str, Tensor]) -> None:
+        """Refuse to go on from networks of other sizes."""
+        ours = self.state_dict()
+        for name in sorted(ours.keys() | theirs.keys()):
+            given, here = (list(s[name].shape) if name in s else "none" for s in (theirs, ours))
+            if given != here:
+                raise ValueError(
+                    f"the checkpoint has other networks: {name} is {given} there, {here} here. "
+                    "Set the networks as in config.yaml of its run"
+                )
 
     def _check_stage(self, stage: str | None) -> None:
         """Refuse to go on from the checkpoint of another stage."""
