@@ -115,10 +115,9 @@ def test_a_dry_run_is_of_a_fit(capsys):
 def test_a_dry_run_sees_scans_as_the_sensor_of_the_run(monkeypatch):
     """A checkpoint to start from is compared with them."""
     measured = []
-    monkeypatch.setattr(
-        dry_run_module, "measure_steps", lambda _, data, *a, **k: measured.append(data)
-    )
+    monkeypatch.setattr(dry_run_module, "measure_steps", lambda *given, **_: measured.append(given))
     data = LidarDataModule("scans", sensor="vlp16", image_columns=64)
     module = SimpleNamespace(sit=SimpleNamespace(feature_dim=16))
     DryRun(module, data, None)._measure(StepSettings())
-    assert measured[0].known_projection == data.known_projection
+    ((_, scans, _),) = measured
+    assert scans.known_projection == data.known_projection

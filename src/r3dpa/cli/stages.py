@@ -402,7 +402,7 @@ def _newest(run_dir: Path) -> str | None:
     if newest is None:
         return None
     if newest != last and last.exists():  # a copied folder may have the times of copying
-        newest = max(last, newest, key=lambda path: read_checkpoint(path).step)
+        newest = max(last, newest, key=lambda path: read_checkpoint(path).step or 0)
     return str(newest)
 
 
