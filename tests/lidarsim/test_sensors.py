@@ -89,7 +89,8 @@ def test_a_calibration_file_replaces_the_beam_table(tmp_path):
     sensor = load_sensor(str(path), shots=100)
     assert sensor.lasers.inclination_rad == (0.03, -0.1, -0.3)
     assert sensor.lasers.azimuth_offset_rad == (0.01, 0.02, 0.0)
-    assert sensor.lasers.height_m == (0.2, 0.2, 0.2)
+    height_m = 0.2 / np.cos([0.03, -0.1, -0.3])  # in the file, across the beam
+    assert sensor.lasers.height_m == pytest.approx(height_m)
     assert sensor.lasers.lateral_m == (-0.026, -0.026, -0.026)
     assert sensor.rays.origin.shape == (3, 3, 100)
 

@@ -112,7 +112,7 @@ class DryRun:
                 batch_size=settings.batch_size,
                 val_every=None,
             )
-            # Images as those of the run, which a checkpoint to start from may compare.
+            # With the beams of the run: a checkpoint to start from is compared with them.
             scans.beams, scans.projection_kind = data.beams, data.projection_kind
             if hasattr(module, "latents_dir"):
                 # The cache of the run itself is for its own scans.
