@@ -155,7 +155,7 @@ class _RecordConfig(SaveConfigCallback):
         loggers = config.trainer.logger
         for logger in loggers if isinstance(loggers, list) else [loggers]:
             arguments: Any = getattr(logger, "init_args", {})
-            for key, value in wandb_names(config).items():
+            for key, value in _wandb_names(config).items():
                 if arguments.get(key) == value:
                     arguments[key] = None
         text = self.parser.dump(config, skip_unset=False, skip_validation=True)
@@ -365,17 +365,18 @@ class StageCLI(LightningCLI):
 
     def _name_wandb_run(self, init_args: Any, run_dir: Path) -> None:
         """Fill what the configuration leaves open; `test` and a resumed `fit` join the run."""
-        note, first = run_dir / _WANDB_ID, cast(Any, rank_zero_only).rank == 0
-        if self.subcommand == "fit" and first and not note.exists():
+        note = run_dir / _WANDB_ID
+        is_first = cast(Any, rank_zero_only).rank == 0
+        if self.subcommand == "fit" and is_first and not note.exists():
             write_text(note, uuid.uuid4().hex[:8])
-        for key, value in wandb_names(self.config[self.subcommand]).items():
+        for key, value in _wandb_names(self.config[self.subcommand]).items():
             if init_args.get(key) is None:
                 init_args[key] = value
         if init_args.get("offline"):  # nothing to look at on the web
             os.environ.setdefault("WANDB_SILENT", "true")
 
 
-def wandb_names(config: Any) -> dict[str, str | None]:
+def _wandb_names(config: Any) -> dict[str, str | None]:
     """Name, group, type and id of the wandb run of a configuration, by its ``run_dir``."""
     run_dir, model = Path(config.run_dir), config.get("model")
     note = run_dir / _WANDB_ID

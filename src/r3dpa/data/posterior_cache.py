@@ -79,13 +79,13 @@ def fill_cache(
         share = items[trainer.local_rank :: trainer.num_devices]
     else:
         share = items[trainer.global_rank :: trainer.world_size]
-    of_share, share = len(share), cache.missing(share)
-    if share:
-        rank_zero_info(f"making {len(share)} of {of_share} once, into {cache.folder}")
-        keys = [item.cache_key for item in share]
+    missing = cache.missing(share)
+    if missing:
+        rank_zero_info(f"making {len(missing)} of {len(share)} once, into {cache.folder}")
+        keys = [item.cache_key for item in missing]
         num_done = 0
         with cache.writer(trainer.global_rank) as writer:
-            for rows in rows_of(share):
+            for rows in rows_of(missing):
                 writer.add(keys[num_done : num_done + len(rows)], rows)
                 num_done += len(rows)
     trainer.strategy.barrier("cached tensors: all are written")

@@ -253,7 +253,8 @@ def _path_nodes(
     path = interpolant.coefficients(time)
     log_snr = (path.alpha / path.sigma).log()
     # Rounding keeps it finite on the cosine path, and diffusions end just before both.
-    log_snr[time == 1], log_snr[time == 0] = -math.inf, math.inf
+    log_snr[time == 1] = -math.inf
+    log_snr[time == 0] = math.inf
     nodes = [PathCoefficients(*row) for row in torch.stack(path, dim=1).tolist()]
     return nodes, log_snr.diff().tolist()
 
