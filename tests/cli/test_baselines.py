@@ -163,6 +163,13 @@ def test_reflectance_is_for_the_baselines(smoke_args, tmp_path):
         main(smoke_args("vae_alignment", tmp_path, "--trainer.logger=false", codec))
 
 
+def test_baselines_refuse_what_they_do_not_generate(smoke_root, tmp_path):
+    codec = "{encoding: log2, return_channel: true, intensity_channel: true}"
+    words = fit_words("fit", "r2flow", smoke_root, tmp_path, f"--data.init_args.codec={codec}")
+    with pytest.raises(ValueError, match="stage r2flow generates no intensity_channel"):
+        main(words)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("stage", TINY)
 @pytest.mark.filterwarnings("ignore:.*fast_dev_run.*")
