@@ -164,7 +164,7 @@ def test_reflectance_is_for_the_baselines(smoke_args, tmp_path):
 
 
 def test_baselines_refuse_what_they_do_not_generate(smoke_root, tmp_path):
-    codec = "{encoding: log2, return_channel: true, intensity_channel: true}"
+    codec = "{reflectance: false, return_channel: true, intensity_channel: true}"
     words = fit_words("fit", "r2flow", smoke_root, tmp_path, f"--data.init_args.codec={codec}")
     with pytest.raises(ValueError, match="stage r2flow generates no intensity_channel"):
         main(words)
