@@ -148,7 +148,6 @@ class Fault:
 
     def _beams(self, scan: RecordedScan, generator: np.random.Generator) -> NDArray[np.bool_]:
         rings = rings_of(scan)
-        is_empty = ~scan.points.any(axis=1)  # shots without a return have no beam
         if rings.sure < _LEAST_SURE or rings.num_rings < 2:
             raise ValueError(
                 f"{self.kind} needs the beam of each point, but only {rings.sure:.0%} of the "
@@ -157,6 +156,7 @@ class Fault:
             )
         number = np.arange(rings.num_rings)
         kept = round((1 - self.amount) * rings.num_rings)
+        is_empty = ~scan.points.any(axis=1)  # shots without a return have no beam
         if self.kind == "missing_beams":
             return is_empty | (generator.permutation(number) < kept)[rings.ring]
         chosen = (number + 1) * kept // rings.num_rings > number * kept // rings.num_rings

@@ -98,6 +98,16 @@ def recipe_of(words, makefile="Makefile"):
     return "\n".join(re.sub(r"^.*?\.venv/bin/r3dpa ", "r3dpa ", line) for line in lines)
 
 
+def test_a_sensor_that_is_given_is_not_estimated():
+    """And one in the folder that is made anew is not deleted."""
+    assert "data sensor" in recipe_of("my-sensor DATA=scans")
+    recipe = recipe_of("my-sensor DATA=scans SENSOR=vlp16")
+    assert "data sensor" not in recipe
+    assert "data plan 'vlp16'" in recipe
+    with pytest.raises(AssertionError, match=r"copy runs/my_sensor/sensor\.yaml out of it"):
+        recipe_of("my-sensor DATA=scans SENSOR=runs/my_sensor/sensor.yaml")
+
+
 def documented():
     found = {}
     for name, text in documents().items():

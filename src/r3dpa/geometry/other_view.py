@@ -101,7 +101,8 @@ def view_of(range_m: Tensor, source: Projection, target: BeamProjection) -> tupl
         view = _read_at(unproject(guess, target), source)
         seen = _interpolated(range_m, view)
     # A filled pixel has no values: they are read in the row beside it.
-    batch, share = torch.arange(len(seen), device=seen.device)[:, None, None], view.share
+    batch = torch.arange(len(seen), device=seen.device)[:, None, None]
+    share = view.share
     for rows, other in ((view.above, 1.0), (view.below, 0.0)):
         share = torch.where(has_return[batch, rows, view.column], share, other)
     return _inside(seen, target.sensor), view._replace(share=share)

@@ -102,7 +102,7 @@ class ReconstructionQuality(Metric):
             getattr(self, name).add_(values.sum())
 
     def compute(self) -> dict[str, float]:
-        """Return the figures by name."""
+        """Return the figures by name, NaN where nothing was compared."""
 
         def ratio(numerator: str, denominator: str) -> float:
             total = getattr(self, denominator).item()
