@@ -122,7 +122,7 @@ class SceneGenerator:
         self._strong = ScheduledVelocity(self.sit, compile, graphs, guidance)
         self._weak = None if weak is None else ScheduledVelocity(weak, compile, graphs)
         self._autoguidance = autoguidance
-        self._decode = torch.compile(self.vae.decode, dynamic=False) if compile else self.vae.decode
+        self._draw = torch.compile(self.vae.draw, dynamic=False) if compile else self.vae.draw
         self._velocity: Velocity = self._strong
         self._prepared: tuple[SamplerConfig, torch.device] | None = None
 
@@ -250,7 +250,7 @@ class SceneGenerator:
         if self._weak is not None:
             self._weak.sit.to(device)
         self._use_channels_last_on_gpu()
-        self._decode = self.vae.decode
+        self._draw = self.vae.draw
         return self
 
     def with_sampler(self, sampler: SamplerConfig) -> SceneGenerator:
@@ -343,7 +343,8 @@ class SceneGenerator:
         """Ranges of normalised latents, and intensities and classes where the VAE has them.
 
         Scenes with numbers ``indices`` of the collection ``seed`` get back what a VAE does not
-        encode: where images have a return channel, they lose single returns at random, see
+        encode. A texture draws it, see :class:`r3dpa.nn.texture.Texture`. Without a texture, where
+        images have a return channel, they lose single returns at random, see
         :meth:`r3dpa.geometry.RangeCodec.drop_returns`, and where the decoder smooths ranges along
         rings (two modes), they have range noise of 1 cm, as scans have.
 
@@ -363,16 +364,22 @@ class SceneGenerator:
         sensor, codec, parts = self.geometry.projection.sensor, self.geometry.codec, []
         for first in range(0, len(latents), size):
             part = self.latent_norm.denormalise(latents[first : first + size].float())
-            image = self._decode(pad_batch(part, size))[: len(part)].float()
-            finite = image.flatten(1).isfinite().all(dim=1)
             numbers = None if indices is None else indices[first : first + size]
-            if numbers is not None and codec.return_channel:
-                uniform = scene_uniform(image.shape[2:], numbers, seed)
+            noise = None
+            if numbers is not None and self.vae.texture:
+                noise_size = self.vae.noise_size((sensor.beams, sensor.columns))
+                noise = scene_normal((noise_size,), numbers, seed).to(part.device)
+                noise = pad_batch(noise, size)
+            image = self._draw(pad_batch(part, size), noise)[: len(part)].float()
+            finite = image.flatten(1).isfinite().all(dim=1)
+            without_noise = None if self.vae.texture else numbers
+            if without_noise is not None and codec.return_channel:
+                uniform = scene_uniform(image.shape[2:], without_noise, seed)
                 image = codec.drop_returns(image, uniform.to(image.device))
             pixels = codec.pixels_of(image, sensor)
             range_m = pixels.range_m
-            if numbers is not None and self.vae.modes == 2:
-                range_m = self._with_noise(range_m, numbers, seed)
+            if without_noise is not None and self.vae.modes == 2:
+                range_m = self._with_noise(range_m, without_noise, seed)
             range_m = torch.where(finite[:, None, None], range_m, torch.nan)
             parts.append(pixels._replace(range_m=range_m))
         joined: list[Any] = [

@@ -30,10 +30,12 @@ from r3dpa.nn.layers import (
 )
 from r3dpa.nn.pixel_outputs import PixelOutputs, RangeMixture, clean_image
 from r3dpa.nn.refinement import Refinement
+from r3dpa.nn.texture import Texture
 
 # AdamW moves a weight by at most the learning rate per step: without this gain, logits need
 # hundreds of steps to learn even the class frequencies.
 _LOGIT_GAIN = 8.0
+_BLOCK_WIDTH = 4  # of the layers of a texture on blocks of pixels, relative to its channels
 _VEGETATION = [known.name for known in SEMANTIC_CLASSES].index("vegetation")
 LevelSizes = tuple[int, int, bool, Size | None]  # input, output, attention, stride
 
@@ -172,7 +174,8 @@ class VAE(Autoencoder):
     of a VAE without these channels give the same latents. Without
     ``encode_further`` there is none, and the latents, which tell of range and return alone, are
     decoded to intensity and class as well. A ``refinement`` corrects ranges and returns pixel by
-    pixel, see :class:`r3dpa.nn.refinement.Refinement`; leaves in training alone.
+    pixel, see :class:`r3dpa.nn.refinement.Refinement`; leaves in training alone. With a
+    ``texture``, images may be drawn with noise, see :class:`r3dpa.nn.texture.Texture`.
 
     Source: Ran et al., "Towards realistic scene generation with LiDAR diffusion models" (CVPR
     2024); R3DPA (ICRA 2026) uses h2p4d8. State-dict keys follow the official checkpoints.
@@ -196,6 +199,7 @@ class VAE(Autoencoder):
             they have none.
         encode_further: The encoder sees intensity and class, not the decoder alone.
         refinement: Channels of the refinement, or 0 for none; needs two modes and classes.
+        texture: Channels of the texture, or 0 for none; needs two modes, intensity and classes.
 
     Example:
         >>> vae = VAE(channels=32, num_res_blocks=1)
@@ -221,6 +225,7 @@ class VAE(Autoencoder):
         num_classes: int = 0,
         encode_further: bool = True,
         refinement: int = 0,
+        texture: int = 0,
     ) -> None:
         if least_scale <= 0:
             raise ValueError(f"least_scale must be above 0, got {least_scale}")
@@ -235,6 +240,11 @@ class VAE(Autoencoder):
             raise ValueError(
                 f"refinement needs modes 2 and num_classes {NUM_CLASSES}, got {modes} and "
                 f"{num_classes}"
+            )
+        if texture and not (modes == 2 and intensity and num_classes == NUM_CLASSES):
+            raise ValueError(
+                f"texture needs modes 2, intensity true and num_classes {NUM_CLASSES}, got "
+                f"{modes}, {intensity} and {num_classes}"
             )
         num_levels = len(channel_multipliers)
         if len(strides) != num_levels - 1:
@@ -262,6 +272,8 @@ class VAE(Autoencoder):
         )
         if refinement:
             decoder.further_refinement = Refinement(widths[0], refinement, stem, least_scale)
+        if texture:
+            decoder.further_texture = Texture(texture, _BLOCK_WIDTH * texture)
         super().__init__(
             encoder,
             decoder,
@@ -271,7 +283,7 @@ class VAE(Autoencoder):
         )
         self.modes, self.least_scale = modes, least_scale
         self.intensity, self.num_classes = intensity, num_classes
-        self.encode_further, self.refinement = encode_further, refinement
+        self.encode_further, self.refinement, self.texture = encode_further, refinement, texture
 
     @property
     def image_channels(self) -> int:
@@ -316,6 +328,34 @@ class VAE(Autoencoder):
         if outputs.classes is not None:
             further.append(outputs.classes.argmax(dim=1, keepdim=True).to(prediction.dtype))
         return torch.cat([image, *further], dim=1) if further else image
+
+    def draw(self, latents: Tensor, noise: Tensor | None) -> Tensor:
+        """Images of raw latents: drawn with noise ``(B, n)``, or without, as of :meth:`decode`."""
+        if noise is None:
+            return self.decode(latents)
+        return self.draw_image(self.predict(latents), noise)
+
+    def draw_image(self, prediction: Tensor, noise: Tensor) -> Tensor:
+        """Images as of :meth:`image_of`, drawn by the texture.
+
+        Args:
+            prediction: ``(B, 22, H, W)`` outputs of the decoder.
+            noise: ``(B, n)`` standard normal, with n as :meth:`noise_size` says.
+        """
+        image = self.image_of(prediction)
+        drawn = self._texture(prediction, image[:, :1], noise)
+        return torch.cat([drawn, image[:, -1:]], dim=1)
+
+    def noise_size(self, image_size: Size) -> int:
+        """Values that an image of ``(H, W)`` pixels is drawn with."""
+        return self._texture.noise_size(image_size)
+
+    @property
+    def _texture(self) -> Texture:
+        texture = self.decoder.further_texture
+        if texture is None:
+            raise ValueError("this VAE has no texture: images cannot be drawn")
+        return cast(Texture, texture)
 
     def scan_of(self, prediction: Tensor) -> Tensor:
         """Images ``(B, in_channels, H, W)`` of outputs, as a discriminator sees scans.
@@ -437,6 +477,7 @@ class _Decoder(nn.Module):
         self.conv_out = Float32CircularConv2d(first, out_channels * math.prod(stem), kernel)
         self.further_out: nn.Module | None = None
         self.further_refinement: nn.Module | None = None
+        self.further_texture: nn.Module | None = None  # called by VAE.draw_image
         if further:
             self.further_out = Float32CircularConv2d(first, further * math.prod(stem), (1, 1))
 
