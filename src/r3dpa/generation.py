@@ -475,7 +475,7 @@ def _check_average(
 
 def pad_batch(values: Tensor, size: int) -> Tensor:
     """``(B, C, h, w)`` with zeros up to ``size`` samples."""
-    return F.pad(values, (0, 0, 0, 0, 0, 0, 0, size - len(values)))
+    return F.pad(values, (0, 0) * (values.ndim - 1) + (0, size - len(values)))
 
 
 def scene_indices(indices: int | Sequence[int]) -> Sequence[int]:

@@ -27,6 +27,7 @@ from r3dpa.geometry import (
     BeamProjection,
     Pixels,
     Projection,
+    RangeCodec,
     classes_of,
     in_range,
     labels_of,
@@ -111,6 +112,17 @@ def _points_of_scan(scan: ScanLike) -> tuple[Any, ArrayLike | None]:
     return np.column_stack([scan.points, np.asarray(intensity, dtype=np.float32)]), labels
 
 
+def check_intensities(pixels: Pixels, codec: RangeCodec) -> None:
+    """Refuse intensities above 1, where images of the codec have a channel for them."""
+    intensity = pixels.intensity
+    uses_intensity = codec.intensity_channel or codec.reflectance
+    if uses_intensity and intensity is not None and intensity.max() > 1:
+        raise ValueError(
+            f"the scan has intensities up to {intensity.max():g}; the model needs 0..1: divide "
+            "them by their full scale, such as 255"
+        )
+
+
 def _within_limits(range_m: Tensor, projection: Projection) -> Tensor:
     """Range image without returns beyond the limits of the sensor, as of points.
 
@@ -124,7 +136,7 @@ def _within_limits(range_m: Tensor, projection: Projection) -> Tensor:
         )
     if not range_m.isfinite().all():
         raise ValueError("the range image has NaN or infinite values; leave these pixels empty")
-    within = (range_m >= sensor.range_min_m) & (range_m <= sensor.range_max_m)
+    within = (range_m > sensor.range_min_m) & (range_m < sensor.range_max_m)
     if not within.any():
         raise ValueError(
             f"the range image has no return within {sensor.range_min_m:g}.."
@@ -320,7 +332,8 @@ class SceneBatch:
             raise ValueError("the scenes hold NaN: the networks diverged; sample in fp32")
         formats = (formats,) if isinstance(formats, str) else tuple(formats)
         about = {"num": len(self), "nfe": self.nfe, "formats": list(formats)}
-        with SceneWriter(folder, len(self), self.projection, formats, about, overwrite) as writer:
+        # Scenes that an interrupted call left without metadata may be others: they are replaced.
+        with SceneWriter(folder, len(self), self.projection, formats, about, True) as writer:
             writer.put(self.range_m, self.nfe, self.intensity, self.labels)
             writer.close()
             writer.finish(about)

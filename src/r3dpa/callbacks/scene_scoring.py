@@ -17,7 +17,6 @@ from tqdm import tqdm
 
 from r3dpa.data import Scan
 from r3dpa.data.datamodules import LidarDataModule
-from r3dpa.data.scans import find_scans
 from r3dpa.feature_names import DEFAULT_SPACES
 from r3dpa.generation import SamplerConfig
 from r3dpa.geometry import points_of
@@ -88,6 +87,11 @@ class SceneScorer(L.Callback):
         allow_few: bool = False,
         skip_bad: bool = True,
     ) -> None:
+        if split is not None and reference is None:
+            raise ValueError(
+                f"scorer.split {split} selects a part of scorer.reference, which is not given: "
+                "leave it out"
+            )
         self.num_scenes, self.batch_size, self.seed = num_scenes, batch_size, seed
         self.sampler, self.precision = sampler, precision
         self.reference, self.split, self.protocol = reference, split, protocol
@@ -116,9 +120,7 @@ class SceneScorer(L.Callback):
                     f"scorer.reference: {type(datamodule).__name__} does not list its scans: give "
                     "a file of `r3dpa data reference`, or --scorer.num_scenes 0 to score no scenes"
                 )
-            further = datamodule.further_scans  # such as simulated ones: no reference
-            left_out = set(find_scans(further)) if further else set()
-            scans = [scan for scan in datamodule.all_set.scans if scan not in left_out]
+            scans = datamodule.without_further(datamodule.all_set.scans)
             setting = replace(PROTOCOLS[self.protocol or "default"], sensor=datamodule.sensor)
             names = tuple(dict.fromkeys((*DEFAULT_SPACES, *self.ckpt)))
             spaces = feature_spaces(self.spaces or names, self.ckpt, setting, device)

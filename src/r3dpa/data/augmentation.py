@@ -17,10 +17,11 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from lidarsim.weather import WeatherPrior
-from r3dpa.data.datasets import LidarDataset
+from r3dpa.data.datasets import WEATHER_STREAM, LidarDataset
+from r3dpa.geometry import BeamProjection, Projection
 
 # Separate these draws from the draws of the order, which have the same seed.
-_STREAM, _WEATHER_STREAM = 1, 2
+_STREAM = 1
 
 
 @dataclass(frozen=True)
@@ -38,24 +39,32 @@ class View:
     mirrored: bool
     grid_columns: int
 
-    def image(self, image: Tensor) -> Tensor:
+    def image(self, image: Tensor, projection: Projection | None = None) -> Tensor:
         """Reordered image ``(..., W)``, W a multiple of w.
 
         Equals projecting the transformed points, but for those at the border of two pixels: a pixel
         holds its left border only, which mirroring makes the right one. Beams beside the axis
         (``lateral_m`` of a BeamProjection) keep their side: mirrored, they are off by twice that.
+
+        Args:
+            image: ``(..., W)``, or ``(..., H, W)`` with a projection.
+            projection: Of the image, whose beams may be turned against each other.
         """
+        if self.mirrored and isinstance(projection, BeamProjection):
+            image = _with_moved_rows(image, -projection.mirrored_columns())
         return self._reordered(image, -1, image.shape[-1] // self.grid_columns)
 
     def grid(self, grid: Tensor) -> Tensor:
         """Reordered feature grid ``(h * w, D)``, see :meth:`Augmentation.check_extractor`."""
         return self._reordered(grid.unflatten(0, (-1, self.grid_columns)), 1, 1).flatten(0, 1)
 
-    def sample(self, sample: dict[str, Any]) -> dict[str, Any]:
+    def sample(self, sample: dict[str, Any], projection: Projection) -> dict[str, Any]:
         """Transformed training sample; index and name stay."""
         result = dict(sample)
-        for name in result.keys() & {"range_image", "valid_mask", "posterior_moments"}:
-            result[name] = self.image(result[name])
+        for name in result.keys() & {"range_image", "valid_mask"}:
+            result[name] = self.image(result[name], projection)
+        if "posterior_moments" in result:
+            result["posterior_moments"] = self.image(result["posterior_moments"])
         if "feature_grid" in result:
             result["feature_grid"] = self.grid(result["feature_grid"])
         return result
@@ -153,7 +162,14 @@ class AugmentedDataset(Dataset[dict[str, Any]]):
 
     def __getitem__(self, key: tuple[int, int]) -> dict[str, Any]:
         view = self.augmentation.draw(self.seed, *key, self.grid_columns)
+        projection = self.dataset.projection
         if self.weather is None:
-            return view.sample(self.dataset[key[1]])
-        change = partial(self.weather.points, seed=(self.seed, *key, _WEATHER_STREAM))
-        return view.sample(self.dataset.sample(key[1], change))
+            return view.sample(self.dataset[key[1]], projection)
+        change = partial(self.weather.points, seed=(self.seed, *key, WEATHER_STREAM))
+        return view.sample(self.dataset.sample(key[1], change), projection)
+
+
+def _with_moved_rows(image: Tensor, columns: Tensor) -> Tensor:
+    """Image ``(..., H, W)`` whose rows are moved to the right by ``columns`` ``(H,)``."""
+    sources = torch.arange(image.shape[-1]) - columns[:, None]
+    return image.gather(-1, (sources % image.shape[-1]).expand_as(image))

@@ -129,6 +129,11 @@ class LidarDataModule(LoaderModule):
         self.prepare_data_per_node = prepare_data_per_node
         at_least(2, val_every=val_every)
         at_least(1, limit=limit, image_columns=image_columns, repeats=repeats)
+        if repeats > 1 and further_scans is None:
+            raise ValueError(
+                f"repeats {repeats} counts beside further_scans, of which there are none: leave it "
+                "out, or name them"
+            )
         self.scans, self.further_scans, self.repeats = scans, further_scans, repeats
         self.beams: BeamProjection | None = None
         if isinstance(sensor, str):
@@ -227,6 +232,11 @@ class LidarDataModule(LoaderModule):
         """Training and held-out scans within ``limit``."""
         train, val = self.split()
         return evenly(train, self.limit), evenly(val, self.limit)
+
+    def without_further(self, scans: list[Scan]) -> list[Scan]:
+        """Those of some scans that a reference may hold: none of ``further_scans``."""
+        further = set() if self.further_scans is None else set(find_scans(self.further_scans))
+        return [scan for scan in scans if scan not in further]
 
     def points(self, scan: Scan) -> Tensor:
         """Points ``(P, 3)`` or ``(P, 4)`` of one of the scans, metres and intensity."""

@@ -31,6 +31,8 @@ from r3dpa.geometry import (
 )
 from r3dpa.geometry.semantics import UNKNOWN_CLASS, classes_of
 
+WEATHER_STREAM = 2  # of the draws of an item, beside those of its view
+
 #: Function of the points ``(P, 4)`` of a scan.
 Change = Callable[[np.ndarray], np.ndarray]
 
@@ -117,6 +119,8 @@ class LidarDataset(Dataset[dict[str, Any]]):
         # Labels are of the points as they were read: a data module refuses both together.
         labels = torch.from_numpy(read_labels(scan.path, len(read))) if codec.num_classes else None
         try:
+            if codec.reflectance or codec.intensity_channel:
+                _check_intensities(scan.path, read)
             if codec.reflectance or codec.intensity_channel or codec.num_classes:
                 pixels = project_pixels(points, self.projection, labels)
             else:
@@ -186,7 +190,7 @@ class DrawnPoints(PointDataset):
         epoch, index = key if isinstance(key, tuple) else (0, key)
         points = self.points(self.scans[index])
         if self.weather is not None and isinstance(key, tuple):
-            changed = self.weather.points(points.numpy(), (self.seed, epoch, index))
+            changed = self.weather.points(points.numpy(), (self.seed, epoch, index, WEATHER_STREAM))
             points = torch.from_numpy(changed)
             if not in_range(points[:, :3], self.sensor).any():
                 raise _lost_in_weather(self.scans[index].path, self.sensor)
@@ -223,6 +227,16 @@ def points_at_pixels(pixels: Pixels, projection: Projection) -> Tensor:
     if intensity is None:
         intensity = torch.zeros_like(pixels.range_m)
     return points_of(pixels.range_m, projection, intensity=intensity)
+
+
+def _check_intensities(path: Path, points: np.ndarray) -> None:
+    """Refuse points ``(P, 4)`` whose intensities are all 0, as of a file without any."""
+    if not points[:, 3].any():
+        raise ScanError(
+            f"{path}: has no intensities, which images with a channel of intensity need: set "
+            "codec.intensity_channel and codec.reflectance to false, or name the column of the "
+            "intensity with --data.init_args.columns"
+        )
 
 
 def _lost_in_weather(path: Path, sensor: LidarSensor) -> ScanError:

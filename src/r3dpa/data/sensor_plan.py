@@ -116,7 +116,10 @@ class SensorPlan:
 
     @property
     def repeats(self) -> int:
-        """How often a scan of the user occurs per epoch: a third of it, all together."""
+        """How often a scan of the user occurs per epoch: a third of it, all together.
+
+        Where scans are too few to hold any out, each occurs once.
+        """
         wanted = self.num_simulated * _USER_SHARE / (1 - _USER_SHARE)
         return max(1, round(wanted / self.split.num_train))
 

@@ -262,11 +262,12 @@ class CachedTensors(Generic[Item]):
 
     def __init__(self, store: Store, items: Sequence[Item]) -> None:
         self.store, self.items = store, list(items)
-        names = {item.cache_key[0]: item for item in items}
-        self._places = {key: at for key, at in store.places().items() if key[0] in names}
+        keys, places = [item.cache_key for item in items], store.places()
         self._files: dict[int, int] = {}  # descriptor by shard
-        if missing := names.keys() - {key[0] for key in self._places}:
-            raise self._missing([names[name] for name in sorted(missing)])
+        missing = [item for item, key in zip(items, keys, strict=True) if key not in places]
+        if missing:
+            raise self._missing(missing)
+        self._places = {key: places[key] for key in keys}
 
     def read(self, item: Item) -> Tensor:
         """Copy ``shape`` of the row of one item, float32, or uint8 where these are stored.

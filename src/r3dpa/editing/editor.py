@@ -35,7 +35,7 @@ from r3dpa.flow.solvers import AfterStep, Velocity, evaluations, ode_solver, unc
 from r3dpa.flow.times import batch_time
 from r3dpa.generation import SamplerConfig, SceneGenerator, scene_indices
 from r3dpa.geometry import Pixels, labels_of
-from r3dpa.scenes import ScanLike, SceneBatch, map_pixels, scan_pixels
+from r3dpa.scenes import ScanLike, SceneBatch, check_intensities, map_pixels, scan_pixels
 
 COMPLETION_START = 0.2  #: time of the noise that completions start from
 _COMPLETION_DRAWS = 3  # their median has a smaller error than one draw
@@ -373,13 +373,7 @@ class SceneEditor:
     def _encode(self, pixels: Pixels) -> Tensor:
         """Normalised latents of pixels ``(B, H, W)``."""
         codec, vae = self.generator.geometry.codec, self.generator.vae
-        intensity = pixels.intensity
-        uses_intensity = codec.intensity_channel or codec.reflectance
-        if uses_intensity and intensity is not None and intensity.max() > 1:
-            raise ValueError(
-                f"the scan has intensities up to {intensity.max():g}; the model needs 0..1: divide "
-                "them by their full scale, such as 255"
-            )
+        check_intensities(pixels, codec)
         pixels = map_pixels(lambda values: values.to(self.generator.device), pixels)
         image = vae.codec_of_input(codec).to_image(*pixels)
         return self.generator.latent_norm.normalise(vae.encode(image).mean)

@@ -16,7 +16,7 @@ import torch
 from einops import rearrange, repeat
 from torch import Tensor
 
-from r3dpa.geometry.projection import Projection, ray_directions
+from r3dpa.geometry.projection import BeamProjection, Projection, ray_directions
 from r3dpa.geometry.sensor import column_azimuths
 
 _TURN_DEG = 360.0
@@ -116,7 +116,7 @@ def box3d_front_m(
     See :func:`box3d` for the arguments.
     """
     entry_m, exit_m, _ = _ray_spans(projection, centre_m, size_m, yaw_deg)
-    return torch.where(entry_m <= exit_m, entry_m.clamp(min=0), 0.0).float()
+    return torch.where(entry_m <= exit_m, entry_m, 0.0).float()
 
 
 def _ray_spans(
@@ -124,9 +124,9 @@ def _ray_spans(
 ) -> tuple[Tensor, Tensor, str]:
     """Ranges ``(H, W)`` float64 at which rays enter and leave a box, and words for the box.
 
-    Slab test per ray ``t * d`` from the sensor, with the box's centre c and half size s in the
-    axes of the box: the ray is inside for ``max_i min(t_i) <= t <= min_i max(t_i)``, where
-    ``t_i = (c_i -+ s_i) / d_i``. A ray that misses the box leaves before it enters.
+    Slab test per ray ``o + t * d`` from its optical centre, with the box's centre c and half size s
+    in the axes of the box: the ray is inside for ``max_i min(t_i) <= t <= min_i max(t_i)``, where
+    ``t_i = (c_i - o_i -+ s_i) / d_i``. A ray that misses the box leaves before it enters.
     """
     what = (
         f"box at ({', '.join(f'{v:g}' for v in centre_m)}) m of size "
@@ -143,11 +143,22 @@ def _ray_spans(
         raise ValueError(f"{what} contains the sensor, so every ray hits it; move the box away")
     directions = ray_directions(projection, dtype=torch.float64) @ axes.T
     # A ray in the plane of a face gives 0 / 0: it touches the slab everywhere.
-    low = ((centre - half) / directions).nan_to_num(-math.inf, math.inf, -math.inf)
-    high = ((centre + half) / directions).nan_to_num(math.inf, math.inf, -math.inf)
-    entry_m = torch.minimum(low, high).amax(dim=-1)
-    exit_m = torch.maximum(low, high).amin(dim=-1)
-    return entry_m, exit_m, what
+    origins = torch.zeros_like(directions)
+    if isinstance(projection, BeamProjection):
+        origins = projection.origins() @ axes.T
+    low = ((centre - origins - half) / directions).nan_to_num(-math.inf, math.inf, -math.inf)
+    high = ((centre - origins + half) / directions).nan_to_num(math.inf, math.inf, -math.inf)
+    entry = torch.minimum(low, high).amax(dim=-1)
+    leave = torch.maximum(low, high).amin(dim=-1)
+    met = (entry <= leave) & (leave > 0)
+
+    def range_m(along: Tensor, missed: float) -> Tensor:
+        """Distance from the sensor of a place along the rays; ``missed`` where they miss."""
+        along = torch.where(met, along, 0.0).clamp(min=0)
+        distance = (origins + along[..., None] * directions).norm(dim=-1)
+        return torch.where(met, distance, missed)
+
+    return range_m(entry, math.inf), range_m(leave, -math.inf), what
 
 
 def dropped_beams(projection: Projection, kept: Sequence[int]) -> Tensor:

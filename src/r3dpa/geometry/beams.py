@@ -162,6 +162,14 @@ class BeamProjection:
         height_m = self._table("height_m")[:, None].expand_as(azimuth)
         return torch.stack([-lateral_m * azimuth.sin(), lateral_m * azimuth.cos(), height_m], -1)
 
+    def mirrored_columns(self) -> Tensor:
+        """Columns ``(H,)`` int64 by which the rows of a mirrored image move to the right.
+
+        A beam that is turned by a part of a column to one side is turned to the other in a mirror.
+        """
+        step_deg = 360 / self.sensor.columns
+        return (2 * self._table("azimuth_shift_deg") / step_deg).round().long()
+
     def column_order(self) -> Tensor:
         """Columns ``(W,)`` int64 in the order in which the points of a row are listed."""
         return torch.arange(self.sensor.columns)

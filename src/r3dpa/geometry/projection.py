@@ -324,7 +324,13 @@ def pool_cells(
     # Points that do not count have a cell of their own: leaving them out would copy all values.
     cell = torch.where(kept, cell, num_cells)
 
-    counts = torch.bincount(cell, minlength=num_cells + 1)
+    means, counts = pool_by_cell(cell, values, num_cells + 1)
+    return means[:num_cells], counts[:num_cells]
+
+
+def pool_by_cell(cell: Tensor, values: Tensor, num_cells: int) -> tuple[Tensor, Tensor]:
+    """Mean of values ``(P, F)`` over cells by their number ``(P,)``, as of :func:`pool_cells`."""
+    counts = torch.bincount(cell, minlength=num_cells)
     num_bags = (counts + _BAG - 1) // _BAG
     bag_cell = torch.repeat_interleave(num_bags)
     place = (
@@ -333,13 +339,13 @@ def pool_cells(
     first = (counts.cumsum(0) - counts)[bag_cell] + place * _BAG
     values = values.to(torch.promote_types(values.dtype, torch.float32))
     bags = embedding_bag(cell.argsort(stable=True), values, first, mode="sum").double()
-    sums = bags.new_zeros(num_cells + 1, values.shape[1])
+    sums = bags.new_zeros(num_cells, values.shape[1])
     if bags.is_cuda:  # sorts: index_add_ would add in another order on every run
         sums.index_put_((bag_cell,), bags, accumulate=True)
     else:
         sums.index_add_(0, bag_cell, bags)
     means = sums / counts.clamp(min=1).unsqueeze(-1)
-    return means[:num_cells].to(values.dtype), counts[:num_cells]
+    return means.to(values.dtype), counts
 
 
 def _inside_limits(distance: Tensor, sensor: LidarSensor) -> Tensor:

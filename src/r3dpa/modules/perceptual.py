@@ -5,11 +5,14 @@ Letters: B batch, C channels, H x W image size, F width of the tokens.
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
 from r3dpa.features import WaffleIronS2, collate_scans
-from r3dpa.geometry import ScanGeometry, pool_cells, unproject
+from r3dpa.geometry import ScanGeometry, unproject
+from r3dpa.geometry.projection import pool_by_cell
 
 _NUM_SCANS = 3  # of a batch, the first ones: each takes as long as a third of a training step of 8
 _MEAN_WEIGHT = 10.0  # of the mean over a scan, to which errors of single cells add little
@@ -50,9 +53,8 @@ class PerceptualLoss:
         if not both.any():
             return image.sum() * 0
         cells = (means - targets)[both].square().sum(dim=1).mean()
-        mean = counts.to(means) @ means / counts.sum()
-        target = target_counts.to(targets) @ targets / target_counts.sum()
-        return cells + _MEAN_WEIGHT * (mean - target).square().sum()
+        difference = _scan_mean(means, counts) - _scan_mean(targets, target_counts)
+        return cells + _MEAN_WEIGHT * difference.square().sum()
 
     def _cell_means(self, image: Tensor) -> tuple[Tensor, Tensor]:
         """Means ``(cells, F)`` of the tokens of an image ``(C, H, W)``, and points ``(cells,)``."""
@@ -61,16 +63,24 @@ class PerceptualLoss:
         pixels = self.geometry.codec.pixels_of(image, projection.sensor)
         returns = pixels.range_m > 0
         points = unproject(pixels.range_m, projection)[returns]
+        cell_rows, cell_columns = projection.sensor.cell_size(self.geometry.grid_size)
+        row, column = returns.nonzero().unbind(dim=1)
+        cell = row // cell_rows * self.geometry.grid_size[1] + column // cell_columns
         if pixels.intensity is None:
             intensity = torch.full_like(points[:, 0], network.grid.intensity_mean)
         else:
             intensity = pixels.intensity[returns]
         scan = network.prepare(torch.cat([points, intensity[:, None]], dim=1))
         kept = scan.kept.to(image.device)
-        points, intensity = points[kept], intensity[kept]
+        points, intensity, cell = points[kept], intensity[kept], cell[kept]
         standard = (intensity - network.grid.intensity_mean) / network.grid.intensity_std
         distance = points.norm(dim=1)
         features = torch.stack([standard, *points.unbind(dim=1), distance], dim=1)
         batch = collate_scans([scan]).to(image.device)._replace(features=features)
         tokens = network.tokens(batch) if len(kept) else points.new_zeros(0, network.network.width)
-        return pool_cells(points.detach(), tokens, projection, self.geometry.grid_size)
+        return pool_by_cell(cell, tokens, math.prod(self.geometry.grid_size))
+
+
+def _scan_mean(means: Tensor, counts: Tensor) -> Tensor:
+    """Mean ``(F,)`` over all points; a product of matrices would be rounded under autocast."""
+    return (counts[:, None] * means).sum(dim=0) / counts.sum()

@@ -95,6 +95,7 @@ class Stage(L.LightningModule, ABC):
         self.grad_norms: dict[str, Tensor] | None = None  # of this step, if the guard has them
         self.step_skipped = False
         self.residuals = ResidualAverages()
+        self._step_residuals: list[Tensor] = []  # of the batches of this step
 
     @abstractmethod
     def trainable(self) -> dict[str, nn.Module]:
@@ -267,6 +268,8 @@ class Stage(L.LightningModule, ABC):
             factors["adversarial"] = 1.0  # balanced by its gradient, not weighted
         values = {n: value.detach() / factors[n] for n, value in parts.items() if factors[n] != 0}
         values["loss"] = total.detach()
+        if "sit_alignment" in values:
+            self._step_residuals.append(1 + values["sit_alignment"])
         self.logged_losses = values
         self.log_dict({f"train/{name}": value for name, value in values.items()})
         return total
@@ -318,14 +321,18 @@ class Stage(L.LightningModule, ABC):
             group["lr"] = relative.get(group["name"], 1.0) * rate
 
     def _follow_residual(self) -> None:
-        """Add the alignment residual of this step, a mean over the processes, to its averages."""
-        error = self.logged_losses.get("sit_alignment")
-        if error is None or self.step_skipped or self.alignment_ended:
+        """Add the alignment residual of this step to its averages.
+
+        It is the mean over the processes and over the batches that the step accumulates.
+        """
+        residuals, self._step_residuals = self._step_residuals, []
+        if not residuals or self.step_skipped or self.alignment_ended:
             return
         within, decays = self.weights.alignment_release, self.weights.alignment_decays
         if within is not None:
-            mean = cast(Tensor, self.trainer.strategy.reduce(error, reduce_op="mean"))
-            fall = self.residuals.update(1 + mean.item(), decays, within)
+            residual = torch.stack(residuals).mean()
+            mean = cast(Tensor, self.trainer.strategy.reduce(residual, reduce_op="mean"))
+            fall = self.residuals.update(mean.item(), decays, within)
             self.log("train/alignment_fall", fall)
 
     def configure_gradient_clipping(

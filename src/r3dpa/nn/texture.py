@@ -18,7 +18,7 @@ from r3dpa.nn.refinement import NUM_DIFFERENCES, DilatedBlock, neighbour_differe
 
 _BLOCK = (2, 4)  # rows and columns of a block of pixels
 _COARSE = (4, 8)  # rows and columns of blocks that share a value of the coarse noise
-_PIXEL_NOISE, _BLOCK_NOISE, _COARSE_NOISE, _SCAN_NOISE = 4, 8, 4, 4  # channels
+_PIXEL_NOISE, _BLOCK_NOISE, _COARSE_NOISE = 4, 8, 4  # channels
 _ROW_CYCLES = (1, 4, 12, 28)  # over all rows: rings differ, and so do their returns
 _NUM_KNOWN = NUM_DIFFERENCES + 7 + NUM_CLASSES + 2 * len(_ROW_CYCLES)
 _DIFFERENCE = 0.02  # encoded; larger differences to neighbours count by their logarithm
@@ -32,8 +32,8 @@ class Texture(nn.Module):
     """Draws an image from noise and from what a decoder says about its pixels.
 
     The likeliest range of each pixel makes trees smooth and far ground too near, and no pixel
-    loses its return by chance. Here, noise of single pixels, of blocks of 2 x 4 and of 8 x 32
-    pixels and of the whole image takes part: it chooses between the two modes of a range, moves
+    loses its return by chance. Here, noise of single pixels and of blocks of 2 x 4 and 8 x 32 pixels
+    takes part: it chooses between the two modes of a range, moves
     the range, the logit of the return and the intensity. Trained by
     :func:`r3dpa.losses.energy_score`, images of the same latents differ from each other as scans
     of these latents do.
@@ -47,7 +47,7 @@ class Texture(nn.Module):
         super().__init__()
         folded = channels * math.prod(_BLOCK)
         self.conv_in = CircularConv2d(_NUM_KNOWN + _PIXEL_NOISE, channels, (3, 3))
-        self.down = nn.Conv2d(folded + _BLOCK_NOISE + _COARSE_NOISE + _SCAN_NOISE, hidden, 1)
+        self.down = nn.Conv2d(folded + _BLOCK_NOISE + _COARSE_NOISE, hidden, 1)
         self.mid = nn.ModuleList(DilatedBlock(hidden, dilation) for dilation in (1, 2, 4, 1))
         self.up = nn.Conv2d(hidden, folded, 1)
         self.mix = nn.Conv2d(channels + _PIXEL_NOISE, channels, 1)
@@ -70,19 +70,20 @@ class Texture(nn.Module):
         """
         shapes = _noise_shapes((outputs.shape[-2], outputs.shape[-1]))
         parts = noise.split([math.prod(shape) for shape in shapes], dim=1)
-        before, after, blocks, coarse, image = (
+        before, after, blocks, coarse = (
             part.unflatten(1, shape) for part, shape in zip(parts, shapes, strict=True)
         )
         p, q = _COARSE
         coarse = repeat(coarse, "B C h w -> B C (h p) (w q)", p=p, q=q)
         coarse = coarse[:, :, : blocks.shape[2], : blocks.shape[3]]
-        block_noise = torch.cat([blocks, coarse, image.expand(-1, -1, *blocks.shape[2:])], dim=1)
 
         known = torch.cat([self._known(outputs, ranges), before], dim=1)
         hidden = self.conv_in(known.to(self.conv_in.weight.dtype))
         p, q = _BLOCK
         folded = rearrange(F.silu(hidden), "B C (h p) (w q) -> B (C p q) h w", p=p, q=q)
-        folded = self.down(torch.cat([folded, block_noise.to(folded.dtype)], dim=1))
+        folded = self.down(
+            torch.cat([folded, blocks.to(folded.dtype), coarse.to(folded.dtype)], dim=1)
+        )
         for block in self.mid:
             folded = block(folded)
         unfolded = self.up(F.silu(folded))
@@ -116,7 +117,7 @@ class Texture(nn.Module):
 
 
 def _noise_shapes(size: Size) -> list[tuple[int, int, int]]:
-    """Channels, rows and columns of the noise of pixels (twice), blocks, coarse blocks, image."""
+    """Channels, rows and columns of the noise of pixels (twice), blocks, coarse blocks."""
     rows, columns = size
     if rows % _BLOCK[0] or columns % _BLOCK[1]:
         raise ValueError(f"a texture needs images of a multiple of {_BLOCK} pixels, got {size}")
@@ -128,5 +129,4 @@ def _noise_shapes(size: Size) -> list[tuple[int, int, int]]:
         pixels,
         (_BLOCK_NOISE, *blocks),
         (_COARSE_NOISE, *coarse),
-        (_SCAN_NOISE, 1, 1),
     ]
