@@ -83,6 +83,8 @@ def test_a_scan_and_its_labels_become_latents_and_a_labelled_scene(tmp_path):
     assert scenes.intensity.shape == (1, 16, 64)
     with pytest.raises(ValueError, match="needs scans with an intensity"):
         vae.encode(points[:, :3], labels)
+    with pytest.raises(ValueError, match=r"intensities up to 2.*; the model needs 0\.\.1"):
+        vae.encode(points * torch.tensor([1.0, 1, 1, 255]), labels)
 
 
 def test_an_encoder_of_range_and_return_needs_no_intensity(tmp_path):

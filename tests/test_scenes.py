@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from r3dpa.data import read_scan
+from r3dpa.data.scene_writer import SceneWriter
 from r3dpa.editing import EditResult
 from r3dpa.geometry import LidarSensor, Pixels, SphericalProjection, points_of
 from r3dpa.scenes import Scene, SceneBatch, scan_pixels
@@ -100,7 +101,7 @@ def test_an_image_in_millimetres_or_without_a_return_is_no_scan(image):
 
 def test_returns_beyond_the_limits_are_left_out_as_of_points():
     image = torch.full((16, 64), 20.0)
-    image[0], image[1], image[2] = 80.0, 0.5, -1.0
+    image[0], image[1], image[2] = 56.0, 1.0, -1.0  # no point at a limit has a pixel
     for scan in (image, Pixels(image)):
         range_m = scan_pixels(scan, PROJECTION).range_m
         assert (range_m[:3] == -1).all()
@@ -163,6 +164,21 @@ def test_saved_scenes_are_those_of_a_sample(labelled, tmp_path):
     with pytest.raises(ValueError, match="hold NaN"):
         diverged.save(folder, overwrite=True)
     assert len(np.load(folder / "range_m.npy")) == 1
+
+
+def test_scenes_that_a_killed_call_left_are_replaced(labelled, tmp_path, monkeypatch):
+    """Without metadata, they may be of other scenes."""
+    with monkeypatch.context() as patched:
+        patched.setattr(SceneWriter, "finish", killed)
+        with pytest.raises(KeyboardInterrupt):
+            labelled.save(tmp_path / "scenes")
+    folder = labelled[1:].save(tmp_path / "scenes")
+    assert np.array_equal(np.load(folder / "range_m.npy"), labelled.range_m[1:])
+    assert not (folder / "bin" / "000002.bin").exists()
+
+
+def killed(*_):
+    raise KeyboardInterrupt
 
 
 def test_unknown_formats_are_refused_before_anything_is_written(labelled, tmp_path):

@@ -151,6 +151,19 @@ def test_the_split_and_the_limit_choose_scans(data, tmp_path):
     assert [name[0] for name in names["all"]] == ["a", "a", "b", "b"]
 
 
+def test_scans_to_train_on_beside_the_own_ones_are_no_reference(data, tmp_path):
+    for index, points in enumerate(clouds(20, 4)):
+        write_bin(tmp_path / "simulated" / f"{index:03d}.bin", points)
+    content = yaml.safe_load(data.read_text())
+    content["data"]["init_args"] |= {"further_scans": str(tmp_path / "simulated"), "repeats": 2}
+    path, out = tmp_path / "data.yaml", tmp_path / "reference.safetensors"
+    path.write_text(yaml.safe_dump(content))
+    command.reference(data=path, out=out, spaces=("fgeo",))
+    names = ReferenceStatistics.load(out).names
+    assert len(names) == 12
+    assert {name[0] for name in names} == {"a", "b"}
+
+
 def test_bad_samples_stop_or_are_listed(reference_file, no_figures, samples, tmp_path, capsys):
     """The reader refuses the first, the scorer the second: all its points are beside the grid."""
     (samples / "004.bin").write_bytes(b"no points")

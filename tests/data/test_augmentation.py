@@ -6,12 +6,18 @@ import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 from torch.utils.data import default_collate
 
-from lidarsim import simulate
+from lidarsim import Simulator, simulate
 from lidarsim.weather import WeatherPrior
 from r3dpa.data import Augmentation, LidarDataModule, PointDataModule, find_scans, read_scan
 from r3dpa.data.augmentation import View
 from r3dpa.features import GeometricFeatures
-from r3dpa.geometry import LidarSensor, SphericalProjection, pool_cells, range_image
+from r3dpa.geometry import (
+    BeamProjection,
+    LidarSensor,
+    SphericalProjection,
+    pool_cells,
+    range_image,
+)
 
 GRID = (8, 64)
 PROJECTION = SphericalProjection(LidarSensor())
@@ -82,6 +88,17 @@ def test_reordering_equals_projecting_anew(source, view, request):
         image = view.image(range_image(inner[:, :3], PROJECTION)[0])
         expected, _ = range_image(seen_from(view, inner)[:, :3], PROJECTION)
         assert (image - expected).abs().max() < 1e-5  # rounding of coordinates up to 56 m
+
+
+def test_mirrored_beams_that_are_turned_against_each_other():
+    """Those of an Ouster are, by nearly half a column; its optical centres are on the axis."""
+    projection = BeamProjection.for_networks("os1_128")
+    assert projection.mirrored_columns().unique().tolist() == [-1, 1]
+    points = torch.from_numpy(Simulator(seed=0, sensor="os1_128").scan(0).points)
+    view = View(8, True, 64)
+    image = view.image(range_image(points[:, :3], projection)[0], projection)
+    expected, _ = range_image(seen_from(view, points)[:, :3], projection)
+    assert ((image - expected).abs() > 1e-3).float().mean() < 0.01
 
 
 def test_a_view_of_a_grid_equals_extracting_from_the_view(extractor, simulated_scans):
@@ -249,6 +266,21 @@ def test_weather_of_points_to_prepare(data):
     held_out = PointDataModule(source, lambda points, generator: points)
     held_out.setup("fit")
     assert torch.equal(module.val_set[0], held_out.val_set[0])
+
+
+def test_weather_of_points_does_not_say_how_they_are_turned(data):
+    """Both are drawn for an item; with one stream of numbers bad weather would turn to the left."""
+    source = data(weather=None)
+    sizes = {}
+    for weather in (None, STORMY):
+        module = PointDataModule(source, lambda p, g: (len(p), g.random()), weather=weather)
+        module.setup("fit")
+        sizes[weather] = [module.train_set[epoch, 0] for epoch in range(40)]
+    clear, drawn = sizes[None][0][0], sizes[STORMY]
+    assert sizes[None] == [(clear, turn) for _, turn in drawn]
+    turns = [turn for size, turn in drawn if size != clear]
+    assert min(turns) < 0.3
+    assert max(turns) > 0.7
 
 
 def test_weather_is_refused_where_something_would_not_follow(data, scaled_points):

@@ -236,6 +236,7 @@ def test_grids_of_a_single_file_need_a_folder(tmp_path, data, sensor, scaled_poi
         ({"batch_size": 0}, "batch_size must be at least 1, got 0"),
         ({"val_every": 1}, "val_every must be at least 2"),
         ({"seed": -1}, "seed must be at least 0"),
+        ({"repeats": 3}, "repeats 3 counts beside further_scans, of which there are none"),
     ],
 )
 def test_bad_arguments_are_refused(data, options, message):

@@ -10,7 +10,7 @@ from lidarsim.scan_files import ScanError
 from lidarsim.weather import WeatherPrior
 from r3dpa.data import Augmentation, FeatureGrids, LidarDataModule, LidarDataset, find_scans
 from r3dpa.data.augmentation import View
-from r3dpa.data.datasets import DrawnPoints
+from r3dpa.data.datasets import WEATHER_STREAM, DrawnPoints
 from r3dpa.data.feature_grids import write_feature_grids
 from r3dpa.data.store import CachedTensors, tensor_cache
 from r3dpa.geometry import NUM_CLASSES, SEMANTIC_CLASSES, LidarSensor, RangeCodec, RingProjection
@@ -76,14 +76,16 @@ def test_weather_that_leaves_no_point_is_blamed_and_not_the_file(tmp_path, proje
     wall[:, 0], wall[:, 1] = 50, np.arange(30)
     fog = WeatherPrior(probability=1, visibility_m=(1, 1.5))
     epoch = next(
-        n for n in range(40) if fog.draw(np.random.default_rng((0, n, 0))).visibility_m < 2
+        n
+        for n in range(40)
+        if fog.draw(np.random.default_rng((0, n, 0, WEATHER_STREAM))).visibility_m < 2
     )
     scans = write(tmp_path, wall)
     points = DrawnPoints(
         scans, projection.sensor, lambda points, generator: points, seed=0, weather=fog
     )
     images = LidarDataset(scans, projection, RangeCodec())
-    in_fog = partial(fog.points, seed=(0, epoch, 0))
+    in_fog = partial(fog.points, seed=(0, epoch, 0, WEATHER_STREAM))
     for sample in (lambda: points[epoch, 0], lambda: images.sample(0, in_fog)):
         with pytest.raises(ScanError, match=r"no point .* in the weather drawn for it: give the"):
             sample()
@@ -110,8 +112,18 @@ def test_labels_of_semantic_kitti_are_a_channel_that_turns_with_the_scan(tmp_pat
     assert sample["range_image"][2:, 0, 8].tolist() == [0.5, -1.0]
     assert sample["range_image"][:, 0, 0].tolist() == [-1.0] * 4
     assert sample["valid_mask"].sum() == 2
-    turned = View(columns=1, mirrored=False, grid_columns=8).sample(sample)["range_image"]
-    assert turned[3, 0, 20] == car
+    turned = View(columns=1, mirrored=False, grid_columns=8).sample(sample, projection)
+    assert turned["range_image"][3, 0, 20] == car
+
+
+@pytest.mark.parametrize("channel", ["intensity_channel", "reflectance"])
+def test_a_scan_without_intensities_is_refused_where_images_have_them(
+    tmp_path, projection, channel
+):
+    np.save(tmp_path / "000000.npy", np.array([[14, 0, 0], [0, 20, 0]], np.float32))
+    codec = RangeCodec("log2", return_channel=channel == "intensity_channel", **{channel: True})
+    with pytest.raises(ScanError, match=r"000000\.npy: has no intensities"):
+        LidarDataset(find_scans(tmp_path), projection, codec)[0]
 
 
 def test_labels_do_not_follow_the_points_of_a_weather(tmp_path):
@@ -128,7 +140,7 @@ def test_posteriors_turn_with_the_scan(tmp_path, make_scans, projection):
         writer.add([scan.cache_key for scan in scans], moments)
     posteriors = CachedTensors(cache, scans)
     sample = LidarDataset(scans, projection, RangeCodec(), posteriors=posteriors)[1]
-    seen = View(columns=3, mirrored=False, grid_columns=8).sample(sample)
+    seen = View(columns=3, mirrored=False, grid_columns=8).sample(sample, projection)
     assert torch.equal(seen["posterior_moments"], moments[1].roll(6, -1))
     assert (seen["index"], seen["name"]) == (1, scans[1].name)
 

@@ -160,6 +160,8 @@ def test_a_replaced_file_is_noticed_and_has_a_row_of_its_own(halves, change):
     assert halves.missing(new) == new
     with pytest.raises(StoreError, match=r"0000000000\.bin.* was replaced.*with a command"):
         CachedTensors(halves, old).read(*new)
+    with pytest.raises(StoreError, match=r"0000000000\.bin.* was replaced"):
+        CachedTensors(halves, new)
     with halves.writer(1) as writer:
         add(writer, new)
     assert_holds(halves, old)

@@ -21,14 +21,23 @@ from r3dpa.editing.regions import (
     sensor_pair,
     token_mask,
 )
-from r3dpa.geometry import LidarSensor, RingProjection, SphericalProjection
-from r3dpa.geometry.projection import ray_directions
+from r3dpa.geometry import BeamProjection, LidarSensor, RingProjection, SphericalProjection
+from r3dpa.geometry.projection import ray_directions, unproject
 
 # Rays at inclination 15, 5, -5, -15 and azimuth 175, 165, ..., -175 degrees.
 COARSE = SphericalProjection(LidarSensor(4, 36, 20.0, -20.0))
 FINE = SphericalProjection(LidarSensor(32, 128, 20.0, -30.0))
 DENSE = SphericalProjection(LidarSensor(16, 72, 20.0, -20.0, range_max_m=25.0))
-DENSE_RINGS = RingProjection(DENSE.sensor, tuple(17.0 - 2 * row - row**2 / 70 for row in range(16)))
+INCLINATIONS = tuple(17.0 - 2 * row - row**2 / 70 for row in range(16))
+DENSE_RINGS = RingProjection(DENSE.sensor, INCLINATIONS)
+# Optical centres a metre above and half a metre beside the origin.
+DENSE_BEAMS = BeamProjection(
+    DENSE.sensor,
+    INCLINATIONS,
+    height_m=(1.0,) * 16,
+    lateral_m=(0.5,) * 16,
+    azimuth_shift_deg=(1.0,) * 16,
+)
 ABOVE = SphericalProjection(LidarSensor(4, 36, 60, 25))
 RINGS = RingProjection(LidarSensor(4, 36, 20.0, -20.0), (18.0, 2.0, -1.0, -19.0))
 
@@ -130,6 +139,15 @@ def test_the_near_side_of_a_box_is_where_rays_enter_it():
     torch.testing.assert_close(front_m[mask], torch.full((4,), expected), atol=1e-5, rtol=0)
 
 
+def test_the_near_side_of_a_box_before_rays_that_start_beside_the_origin():
+    """A wall 10 m ahead: where the rays enter it is their range from the origin."""
+    front_m = box3d_front_m(DENSE_BEAMS, (10.5, 0, 0), (1, 40, 20))
+    mask = box3d(DENSE_BEAMS, (10.5, 0, 0), (1, 40, 20))
+    points = unproject(front_m.double(), DENSE_BEAMS)[mask]
+    assert len(points) > 200
+    torch.testing.assert_close(points[:, 0], torch.full_like(points[:, 0], 10), atol=1e-4, rtol=0)
+
+
 def test_points_in_a_turned_box():
     """A box of 4 x 2 x 1 m turned by 90 degrees is 2 m long along x and 4 m along y."""
     points = torch.tensor([[10.9, 1.9, 0.4], [11.1, 0, 0], [10, 2.1, 0], [10, 0, 0.6], [10, 0, 0]])
@@ -155,9 +173,13 @@ def marched(projection, centre, size, yaw_deg, step=0.01):
     places = torch.arange(sensor.range_min_m + step, sensor.range_max_m, step, dtype=torch.float64)
     yaw = math.radians(yaw_deg)
     directions = ray_directions(projection, dtype=torch.float64)
+    origins = torch.zeros_like(directions)
+    if isinstance(projection, BeamProjection):
+        origins = projection.origins()
     mask = torch.zeros(directions.shape[:2], dtype=torch.bool)
     for row in range(len(directions)):
-        x, y, z = (directions[row, :, None] * places[:, None]).unbind(-1)
+        rays = origins[row, :, None] + directions[row, :, None] * places[:, None]
+        x, y, z = rays.unbind(-1)
         x, y, z = x - centre[0], y - centre[1], z - centre[2]
         u, v = x * math.cos(yaw) + y * math.sin(yaw), y * math.cos(yaw) - x * math.sin(yaw)
         inside = (u.abs() < size[0] / 2) & (v.abs() < size[1] / 2) & (z.abs() < size[2] / 2)
@@ -165,7 +187,9 @@ def marched(projection, centre, size, yaw_deg, step=0.01):
     return mask
 
 
-@pytest.mark.parametrize("projection", [DENSE, DENSE_RINGS], ids=["spherical", "rings"])
+@pytest.mark.parametrize(
+    "projection", [DENSE, DENSE_RINGS, DENSE_BEAMS], ids=["spherical", "rings", "beams"]
+)
 @pytest.mark.parametrize("seed", range(3))
 def test_box_is_what_marching_along_the_rays_finds(projection, seed):
     draw = torch.Generator().manual_seed(seed)

@@ -73,6 +73,16 @@ def test_a_stage_ends_its_alignment_by_the_rule(stage):
     assert module.residuals.steps == 3
 
 
+def test_the_residual_of_a_step_is_the_mean_of_its_batches():
+    """Two batches a step: the average is of both, as two processes would have it."""
+    module = stage_module("flow_matching", weights=WEIGHTS, optimizer=OptimizerConfig(lr=0.0))
+    train(module, TinyData([False] * 4), max_steps=1, accumulate_grad_batches=2)
+    residuals = [1 + parts["sit_alignment"].item() / 0.5 for parts in module.parts]
+    assert abs(residuals[0] - residuals[1]) > 1e-3
+    first = module.residuals.fast / (1 - WEIGHTS.alignment_decays[0])
+    assert first == pytest.approx(sum(residuals) / 2, rel=1e-5)
+
+
 def test_a_skipped_step_is_not_averaged():
     module = train(stage_module("flow_matching", weights=WEIGHTS), TinyData([False, True]))
     assert module.guard.skipped == 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from test_range_losses import LabelledData, RangeData, range_module
@@ -12,6 +13,7 @@ from r3dpa.geometry import (
     NUM_CLASSES,
     LidarSensor,
     RangeCodec,
+    RingProjection,
     ScanGeometry,
     SphericalProjection,
     points_of,
@@ -78,6 +80,23 @@ def test_same_images_have_no_distance_and_images_without_points_no_gradient():
     empty = CODEC.to_image(torch.full((1, 16, 128), -1.0), torch.zeros(1, 16, 128))
     (gradient,) = torch.autograd.grad(loss(made, empty), made)
     assert not gradient.any()
+
+
+def test_images_of_rings_have_the_cells_of_their_pixels():
+    """Their points are not in the order of rings that the projection needs."""
+    rings = RingProjection(LidarSensor(16, 128), tuple(np.linspace(2, -24, 16)))
+    loss = PerceptualLoss(ScanGeometry(rings, CODEC, (2, 4)))
+    assert loss(images(0), images(1)) > 1
+
+
+def test_half_precision_has_the_loss_of_float32():
+    """With tokens a hundred times as large, their sum is beyond float16."""
+    loss = PerceptualLoss(GEOMETRY)
+    cell_means = loss._cell_means
+    loss._cell_means = lambda image: (100 * cell_means(image)[0], cell_means(image)[1])
+    expected = loss(images(0), images(1))
+    with torch.autocast("cpu", torch.float16):
+        torch.testing.assert_close(loss(images(0), images(1)), expected, rtol=0.05, atol=0)
 
 
 def test_three_scans_of_a_batch_count():

@@ -32,11 +32,10 @@ class Texture(nn.Module):
     """Draws an image from noise and from what a decoder says about its pixels.
 
     The likeliest range of each pixel makes trees smooth and far ground too near, and no pixel
-    loses its return by chance. Here, noise of single pixels and of blocks of 2 x 4 and 8 x 32 pixels
-    takes part: it chooses between the two modes of a range, moves
-    the range, the logit of the return and the intensity. Trained by
-    :func:`r3dpa.losses.energy_score`, images of the same latents differ from each other as scans
-    of these latents do.
+    loses its return by chance. Here, noise of single pixels and of blocks of 2 x 4 and 8 x 32
+    pixels takes part: it chooses between the two modes of a range, moves the range, the logit of
+    the return and the intensity. Trained by :func:`r3dpa.losses.energy_score`, images of the same
+    latents differ from each other as scans of these latents do.
 
     Args:
         channels: Channels at full resolution.
