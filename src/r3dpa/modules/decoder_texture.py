@@ -178,9 +178,9 @@ def views_of(image: Tensor, likelier: Tensor, returns: Tensor) -> dict[str, Tens
     views["patches"] = _folded(torch.cat([seen, 2 * chance], dim=1), _PATCH)
     views["patterns"] = _folded(chance, _PATTERN)
     for name, area in (("near", _NEAR), ("far", _FAR)):
-        share = F.avg_pool2d(returns.float(), area)
-        views[f"{name}_means"] = F.avg_pool2d(seen, area) / share.clamp(min=_LEAST_RETURNS)
-        views[f"{name}_returns"] = F.avg_pool2d(chance, area)
+        share = _pooled(returns.float(), area)
+        views[f"{name}_means"] = _pooled(seen, area) / share.clamp(min=_LEAST_RETURNS)
+        views[f"{name}_returns"] = _pooled(chance, area)
     return views
 
 
@@ -199,10 +199,16 @@ def masks_of(returns: Tensor) -> dict[str, Tensor]:
     masks["patches"] = _folded(torch.cat([returns, torch.ones_like(returns)], dim=1), _PATCH)
     masks["patterns"] = _folded(torch.ones_like(returns), _PATTERN)
     for name, area in (("near", _NEAR), ("far", _FAR)):
-        share = F.avg_pool2d(returns.float(), area)
+        share = _pooled(returns.float(), area)
         masks[f"{name}_means"] = share >= _LEAST_RETURNS
         masks[f"{name}_returns"] = torch.ones_like(masks[f"{name}_means"])
     return masks
+
+
+def _pooled(image: Tensor, area: tuple[int, int]) -> Tensor:
+    """Means over areas of an image ``(B, C, H, W)``, no larger than the image."""
+    rows, columns = image.shape[-2:]
+    return F.avg_pool2d(image, (min(area[0], rows), min(area[1], columns)))
 
 
 def _folded(image: Tensor, patch: tuple[int, int]) -> Tensor:
