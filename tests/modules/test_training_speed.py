@@ -135,7 +135,7 @@ class TestLayout:
         module = stage_module("joint", compile=True)
         names = list(module.state_dict())
         train(module)
-        assert compiled == ["_Encoder", "_Decoder", "PatchDiscriminator", "SiTBlock", "SiTBlock"]
+        assert compiled == ["Encoder", "Decoder", "PatchDiscriminator", "SiTBlock", "SiTBlock"]
         assert list(module.state_dict()) == names
 
     @pytest.mark.slow

@@ -61,8 +61,8 @@ def reference(
     module = read_data(data, columns)
     train, val = module.limited_split()
     splits = {"train": train, "val": val, "all": train + val}
-    own = module.without_further(sorted(set(splits[split])))  # a scan may be repeated in training
-    scans = evenly(own, limit)
+    # A scan may be repeated in training.
+    scans = evenly(module.without_further(sorted(set(splits[split]))), limit)
     if len(scans) < 2:
         given = "1 scan" if len(scans) == 1 else "no scans"
         raise ValueError(f"{data}: {given} in split {split}; at least 2 are needed")

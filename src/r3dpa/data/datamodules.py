@@ -234,7 +234,7 @@ class LidarDataModule(LoaderModule):
         return evenly(train, self.limit), evenly(val, self.limit)
 
     def without_further(self, scans: list[Scan]) -> list[Scan]:
-        """Those of some scans that a reference may hold: none of ``further_scans``."""
+        """Scans that a reference may hold: all but ``further_scans``."""
         further = set() if self.further_scans is None else set(find_scans(self.further_scans))
         return [scan for scan in scans if scan not in further]
 

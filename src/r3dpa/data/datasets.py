@@ -31,7 +31,7 @@ from r3dpa.geometry import (
 )
 from r3dpa.geometry.semantics import UNKNOWN_CLASS, classes_of
 
-WEATHER_STREAM = 2  # of the draws of an item, beside those of its view
+WEATHER_STREAM = 2  # of the draws of an item; those for its view have stream 1
 
 #: Function of the points ``(P, 4)`` of a scan.
 Change = Callable[[np.ndarray], np.ndarray]

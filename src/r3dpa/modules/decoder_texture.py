@@ -53,8 +53,8 @@ class DecoderTexture(VAEAlignment):
 
     Two images are drawn from the decoded latents of each scan, and compared with the scan by the
     energy score of several views of them: single pixels, differences to neighbours along and
-    across rings, patches, and means over areas. Each view alone is a proper score, which no other
-    distribution of images improves than that of the scans with these latents.
+    across rings, patches, and means over areas. The score of each view is proper: it is smallest
+    where images are spread as the scans with these latents are.
 
     Source: energy score: Gneiting and Raftery, "Strictly proper scoring rules, prediction, and
     estimation" (JASA 2007); networks trained by it with two draws: Shen and Meinshausen,
@@ -63,7 +63,7 @@ class DecoderTexture(VAEAlignment):
     Args:
         vae: Range-image autoencoder with a texture.
         sit: Velocity network; takes no part.
-        **kwargs: See :class:`GenerativeModule`. Of the loss weights none counts.
+        **kwargs: See :class:`GenerativeModule`. Of the loss weights ``texture`` counts.
     """
 
     stage = "decoder_texture"
