@@ -21,8 +21,8 @@ from r3dpa.modules.vae_alignment import VAEAlignment
 from r3dpa.nn import VAE, VelocityNetwork
 from r3dpa.nn.layers import at_least_float32
 
-# Encoded ranges from which on differences count by their logarithm: .001 is 2 cm at 10 m.
-_FROM_LIKELIER, _ALONG_RINGS, _ACROSS_RINGS, _BENDS = 0.01, 0.001, 0.002, 0.0005
+# Encoded ranges from which on differences count by their logarithm: .005 is 1 % in log2.
+_FROM_LIKELIER, _ALONG_RINGS, _ACROSS_RINGS, _BENDS = 0.01, 0.005, 0.005, 0.003
 _PATCH, _PATTERN = (2, 8), (1, 4)  # rows and columns
 _WEIGHTS = {
     "ranges": 1.0,

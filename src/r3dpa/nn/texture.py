@@ -23,8 +23,8 @@ _ROW_CYCLES = (1, 4, 12, 28)  # over all rows: rings differ, and so do their ret
 _NUM_KNOWN = NUM_DIFFERENCES + 7 + NUM_CLASSES + 2 * len(_ROW_CYCLES)
 _DIFFERENCE = 0.02  # encoded; larger differences to neighbours count by their logarithm
 _OUTPUT_FACTOR = 0.2  # brings logits and logarithms of scales near [-1, 1]
-_LOG_MOVE = -7.0  # size of the first moves of ranges, encoded: .001, 2 cm at 10 m
-_LOG_MOVES = (-10.0, -1.0)
+_LOG_MOVE = -6.0  # size of the first moves of ranges, encoded: .0025, 5 cm at 10 m
+_LOG_MOVES = (-10.0, -3.5)  # at most 6 % of the range in log2
 _INTENSITY = 0.2  # encoded, unit of the moves of intensities
 
 
@@ -106,11 +106,12 @@ class Texture(nn.Module):
     def _image(self, outputs: Tensor, ranges: Tensor, drawn: Tensor) -> Tensor:
         """Image of the outputs of a decoder, moved by what was drawn ``(B, 5, H, W)``."""
         choice, move, log_size, returns, intensity = drawn.split(1, dim=1)
-        near, far = outputs[:, :1], outputs[:, 1:2]
-        other = torch.where((ranges - near).abs() < (ranges - far).abs(), far, near)
-        share = torch.sigmoid(4 * choice - 4)  # of the other mode
+        first, second, logit = outputs[:, :1], outputs[:, 1:2], outputs[:, 4:5]
+        at_first = (ranges - first).abs() < (ranges - second).abs()
+        other, odds = torch.where(at_first, second, first), torch.where(at_first, -logit, logit)
+        share = torch.sigmoid(4 * choice + odds.clamp(-8, 8) - 3)  # of the other mode
         size = (_LOG_MOVE + log_size).clamp(*_LOG_MOVES).exp()
-        moved = ranges + share * (other - ranges) + size * move
+        moved = ranges + share * (other - ranges) + size * move.tanh()
         logits = 2 * outputs[:, 5:6] + 4 * returns
         return torch.cat([moved, logits, outputs[:, 6:7] + _INTENSITY * intensity], dim=1)
 
