@@ -20,8 +20,7 @@ folder. Everything else needs only NumPy.
 from __future__ import annotations
 
 import io
-import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -431,37 +430,6 @@ WRITERS: dict[str, Callable[[PointCloud, float | None], bytes]] = {
     ".las": _las_of,
     ".laz": partial(_las_of, suffix=".laz"),
 }
-
-
-def find_files(source: Path) -> tuple[Path, list[Path]]:
-    """Folder that names are relative to, and the scans of a file or folder, sorted."""
-    if source.is_file():
-        return source.parent, [source]
-    everything = sorted(files_below(source))
-    files = [file for file in everything if suffix_of(file) in READERS]
-    if not files:
-        raise ScanError(f"{source}: {_why_no_scan(source, everything)}; can be read: {READABLE}")
-    return source, files
-
-
-def _why_no_scan(source: Path, files: Sequence[Path]) -> str:
-    if files:
-        return (
-            f"is no folder with scans, it holds {len(files)} other files, such as {files[0].name}"
-        )
-    return "is an empty folder" if source.is_dir() else "is no folder and no file"
-
-
-def files_below(root: Path) -> Iterator[Path]:
-    """Files of a folder and its sub-folders, links followed, without hidden ones."""
-    seen = set()
-    for folder, below, names in os.walk(root, followlinks=True):
-        real = os.path.realpath(folder)
-        # Of a folder and a link to it, the same one on every machine; of a link upwards, none.
-        below[:] = [] if real in seen else sorted(name for name in below if name[0] != ".")
-        if real not in seen:
-            yield from (Path(folder, name) for name in names if name[0] != ".")
-        seen.add(real)
 
 
 def label_path_of(path: Path) -> Path | None:

@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarsim.cloud_formats import ScanError
-from lidarsim.clouds import WRITERS, PointCloud, find_files, read_cloud, suffix_of
+from lidarsim.clouds import WRITERS, PointCloud, read_cloud, suffix_of
 from lidarsim.clouds_bag import is_bag, read_bag
 from lidarsim.io import number_of, write_bytes
 from lidarsim.rings import rings_of
+from lidarsim.scan_folders import find_files
 from lidarsim.weather import recorded_scan
 
 Format = Literal["bin", "pcd.bin", "ply", "npy", "npz", "las", "laz"]

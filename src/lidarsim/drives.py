@@ -17,6 +17,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+from lidarsim.clouds import READERS, suffix_of
 from lidarsim.drive_files import (
     DriveFiles,
     drive_name,
@@ -249,6 +250,11 @@ def _check_folder(out: Path, request: dict[str, Any]) -> bool:
             raise ValueError(
                 f"{out} holds a data set that was not simulated ({_MANIFEST} is missing); "
                 f"give another folder"
+            )
+        if scans := [file for file in sorted(out.glob("*")) if suffix_of(file) in READERS]:
+            raise ValueError(
+                f"{out} holds scans that were not simulated, such as {scans[0].name}, which "
+                "readers would no longer find: give another folder"
             )
         return False
     stored = read_json(manifest, _START_AGAIN)

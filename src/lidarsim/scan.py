@@ -58,6 +58,10 @@ class SimulatedScan:
     effects: tuple[EffectRecord, ...]
     scene: Scene
 
+    def __repr__(self) -> str:
+        ran = [effect.name for effect in self.effects if effect.status == "ran"]
+        return f"SimulatedScan({len(self.points)} points, effects: {', '.join(ran)})"
+
 
 @cache
 def effect_name(effect: Effect) -> str:

@@ -21,6 +21,7 @@ from lidarsim.recorded import Instrument, RecordedScan, RecordedSweep, num_satur
 from lidarsim.scan import (
     SECOND_RETURN_M,
     EffectRecord,
+    SimulatedScan,
     check_switches,
     effect_name,
     run_effect,
@@ -128,7 +129,11 @@ class Weather(scene.Conditions):
 
     @overload
     def apply(
-        self, scan: RecordedScan | str | Path, seed: Seed = 0, *args: Any, **options: Any
+        self,
+        scan: RecordedScan | SimulatedScan | str | Path,
+        seed: Seed = 0,
+        *args: Any,
+        **options: Any,
     ) -> WeatheredScan: ...
     @overload
     def apply(self, scan: Points, seed: Seed = 0, *args: Any, **options: Any) -> Points: ...
@@ -145,7 +150,8 @@ class Weather(scene.Conditions):
 
         Args:
             scan: Array or tensor ``(P, 3)``, or ``(P, 4)`` with intensity; a
-                :class:`PointCloud`; a :class:`RecordedScan`, or the path of a scan.
+                :class:`PointCloud`; a :class:`RecordedScan`, a :class:`SimulatedScan`, or the path
+                of a scan.
             seed: Of the random draws; the draws of each effect do not depend on other effects.
             instrument: What is assumed of the instrument.
             boxes: ``(N, 8)`` vehicles that throw spray: centre x, y, z, length, width, height in
@@ -155,7 +161,7 @@ class Weather(scene.Conditions):
 
         Returns:
             The kind that was given; a :class:`WeatheredScan`, which says what happened to each
-            point, for a recorded scan or a path.
+            point, for a recorded or simulated scan or a path.
 
         Raises:
             ValueError: If an effect is unknown or cannot act on a recorded scan, or boxes or
@@ -226,6 +232,9 @@ def change_scan(scan: Any, change: Callable[[RecordedScan], WeatheredScan]) -> A
         return change(recorded_scan(read_cloud(scan)))
     if isinstance(scan, PointCloud):
         return changed_cloud(scan, change(recorded_scan(scan)))
+    if isinstance(scan, SimulatedScan):
+        points, intensity = scan.points[:, :3], scan.points[:, 3]
+        return change(RecordedScan(points, intensity, labels=scan.labels))
     is_tensor = hasattr(scan, "new_tensor")  # of torch, which is not imported here
     array = scan.detach().cpu().numpy() if is_tensor else np.asarray(scan)
     cloud = PointCloud.of(array)

@@ -99,7 +99,10 @@ def _points_of_scan(scan: ScanLike) -> tuple[Any, ArrayLike | None]:
     if isinstance(scan, str | Path):
         scan = read_cloud(scan)
     if isinstance(scan, PointCloud):
-        return scan.rows()[:, : 3 if scan.intensity is None else 4], scan.labels
+        from r3dpa.data.labels import labels_of_cloud
+
+        rows = scan.rows()[:, : 3 if scan.intensity is None else 4]
+        return rows, labels_of_cloud(scan)
     if isinstance(scan, Scene):
         intensity = None if scan.intensity is None else scan.point_intensity
         labels = None if scan.labels is None else scan.point_labels

@@ -17,6 +17,7 @@ from lidarsim.scan_files import read_npz, read_points, read_scan
 from r3dpa.checkpoints import convert
 from r3dpa.cli import main
 from r3dpa.cli.parser import parse
+from r3dpa.cli.runs import report
 from r3dpa.flow.solvers import ODE_SOLVERS
 from r3dpa.generation import SamplerConfig, SceneGenerator
 from r3dpa.geometry import (
@@ -269,6 +270,12 @@ def test_an_exported_training_gives_the_same_scenes(joint_checkpoint, tmp_path, 
     sample(exported, tmp_path / "last", "--num", 1, "--weights", "last")
     average, last = (np.load(tmp_path / n / "range_m.npy") for n in ("exported", "last"))
     assert not np.allclose(average, last, atol=1e-2)
+
+
+def test_report_of_a_run_that_has_logged_nothing(tmp_path):
+    (tmp_path / "config.yaml").write_text("")
+    with pytest.raises(ValueError, match=r"no logged values yet: .*log_every_n_steps"):
+        report(tmp_path)
 
 
 def test_report_draws_curves_and_lists_the_means_of_their_ends(tmp_path, capsys):

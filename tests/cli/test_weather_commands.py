@@ -294,6 +294,7 @@ BAD = {
     "none": ([], "give an option such as --weather.visibility_m 60 or --weather.rain_mm_h 10"),
     "idle": (["--effects.range_noise", "on"], "no weather is given, so that scans would stay"),
     "none on": (["--effects.range_noise", "off"], "no weather is given, so that scans would stay"),
+    "traffic": (["--weather.traffic_m_s", "20"], "throws up spray on a wet road only: give --wea"),
     "visibility": (["--weather.visibility_m", "0"], "visibility_m must be 1 or greater"),
     "negative": (["--weather.visibility_m", "-5"], "visibility_m must be 1 or greater"),
     "rain": (["--weather.rain_mm_h", "10000"], "rain_mm_h must be at most"),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from lidarsim.scan_files import read_npz, read_points, read_scan
+from lidarsim.scan_files import read_npz, read_points, read_scan, write_bin
 from r3dpa.data import scene_writer
 from r3dpa.data.scene_writer import SceneWriter
 from r3dpa.geometry import LidarSensor, SphericalProjection, points_of
@@ -142,6 +142,24 @@ def test_another_request_is_refused_until_it_may_start_anew(tmp_path):
     assert files(tmp_path) == ["bin/000000.bin", "metadata.json", "range_m.npy"]
     with pytest.raises(ValueError, match=r"holds scenes already.*--overwrite"):
         writer(tmp_path, 4, request=other)
+
+
+def test_a_folder_with_other_scans_is_refused(tmp_path):
+    """Labels of the scenes would be read as labels of these scans."""
+    write_bin(tmp_path / "000000.bin", np.ones((3, 4)))
+    for overwrite in (False, True):
+        with pytest.raises(ValueError, match=r"000000\.bin is a scan that is none of these scenes"):
+            writer(tmp_path, 4, overwrite=overwrite)
+    assert files(tmp_path) == ["000000.bin"]
+
+
+def test_scenes_can_be_made_by_other_numbers_at_once(tmp_path):
+    range_m = scenes(5)
+    finish(tmp_path, range_m, 2, batch_size=2)
+    assert finish(tmp_path, range_m, 3, batch_size=1) == 2
+    with writer(tmp_path, 5, request={"seed": 0, "num": 5, "batch_size": 8}) as stopped:
+        stopped.put(range_m[3:4], nfe=8)
+    assert finish(tmp_path, range_m, 5, batch_size=1) == 4
 
 
 def finish(out, range_m, num, **changes):

@@ -7,8 +7,15 @@ import torch
 from safetensors.torch import save_file
 
 from lidarsim import Semantic
+from lidarsim.clouds import read_cloud
 from r3dpa.data import Scan, ScanError, write_bin
-from r3dpa.data.labels import CLASS_NAMES, read_labels
+from r3dpa.data.labels import (
+    CLASS_NAMES,
+    classes_as_of_cloud,
+    find_labels,
+    labels_of_cloud,
+    read_labels,
+)
 from r3dpa.editing import EditResult, most_like_first
 from r3dpa.editing.objects import ObjectClass, ObjectLibrary, object_library
 from r3dpa.geometry import (
@@ -18,6 +25,7 @@ from r3dpa.geometry import (
     RingProjection,
     SphericalProjection,
 )
+from r3dpa.scenes import scan_pixels
 
 CAR, ROAD = 26, 7
 SENSOR = LidarSensor(beams=4, columns=8, inclination_max_deg=20, inclination_min_deg=-20)
@@ -57,6 +65,30 @@ def test_semantic_kitti_becomes_kitti_360(tmp_path):
     path.write_bytes(bytes(12))
     with pytest.raises(ScanError, match=r"000001\.label holds 3 labels, but its scan 5 points"):
         read_labels(scan, 5)
+
+
+def test_classes_go_back_to_the_ids_of_their_file(tmp_path):
+    scan, car = tmp_path / "velodyne" / "000001.bin", 26
+    write_bin(scan, [[10, 0, 0, 0.5], [0, 10, 0, 0.5], [0, -10, 0, 0.5]])
+    (tmp_path / "labels").mkdir()
+    (tmp_path / "labels" / "000001.label").write_bytes(np.array([10, 40, 50], "<u4").tobytes())
+    cloud = read_cloud(scan)
+    labels = labels_of_cloud(cloud)
+    assert [CLASS_NAMES[label] for label in labels] == ["car", "road", "building"]
+    assert classes_as_of_cloud(labels, cloud).tolist() == [10, 40, 50]
+    assert classes_as_of_cloud(np.array([0, 38, car]), cloud).tolist() == [0, 0, 10]  # 38: a lamp
+    seen = scan_pixels(scan, PROJECTION).classes.unique().tolist()
+    assert {SEMANTIC_CLASSES[n].name for n in seen if n >= 0} == {"car", "road", "building"}
+
+
+@pytest.mark.parametrize("place", ["", "labels", "../labels"])
+def test_labels_lie_in_the_folder_of_a_scan_or_in_one_for_labels(tmp_path, place):
+    scan, folder = tmp_path / "bin" / "0.bin", tmp_path / "bin" / place
+    write_bin(scan, np.ones((2, 4)))
+    assert find_labels(scan, 2) is None
+    folder.mkdir(exist_ok=True)
+    (folder / "0.label").write_bytes(np.array([26, 7], "<u4").tobytes())
+    assert find_labels(scan, 2).tolist() == read_labels(scan, 2).tolist() == [26, 7]
 
 
 # Ahead, left, and right of the sensor; one behind that is out of range.
@@ -291,7 +323,7 @@ def test_objects_that_no_scan_shows_are_refused(tmp_path, scaled_points):
     with pytest.raises(ValueError, match="no labelled point within range"):
         make()
     scans[0].path.parents[1].joinpath("labels", "1.label").unlink()
-    with pytest.raises(ScanError, match=r"1\.bin has no labels: looked for labels/1\.label"):
+    with pytest.raises(ScanError, match=r"1\.bin has no labels: looked for 1\.label in its folder"):
         make()
 
 

@@ -12,9 +12,10 @@ import pytest
 from numpy.lib.recfunctions import unstructured_to_structured
 
 from lidarsim.changed_scans import write_below
-from lidarsim.clouds import PointCloud, find_files, read_cloud, write_cloud
+from lidarsim.clouds import PointCloud, read_cloud, write_cloud
 from lidarsim.faults import STRENGTHS, Fault
 from lidarsim.scan_files import ScanError, read_clouds
+from lidarsim.scan_folders import find_files
 from lidarsim.weather import Weather, changed_cloud, recorded_scan
 
 random = np.random.default_rng(0)
@@ -345,6 +346,18 @@ def test_labels_go_with_their_scan(tmp_path, scan, labels, written):
     (root / labels).resolve().write_bytes(values[:-1].tobytes())
     with pytest.raises(ScanError, match=r"holds 39 labels but .* 40 points: delete the one"):
         read_cloud(path)
+
+
+def test_range_images_of_a_folder_of_scenes_are_no_scans(tmp_path):
+    """An array of such a name elsewhere is one."""
+    for place in ("range_m.npy", "edit/before.npy", "own/range_m.npy"):
+        (tmp_path / place).parent.mkdir(exist_ok=True)
+        np.save(tmp_path / place, np.ones((4, 4)))
+    for place in ("metadata.json", "bin/000000.bin", "edit/metadata.json"):
+        (tmp_path / place).parent.mkdir(exist_ok=True)
+        (tmp_path / place).write_bytes(ROWS.tobytes())
+    found = [file.relative_to(tmp_path).as_posix() for file in find_files(tmp_path)[1]]
+    assert found == ["bin/000000.bin", "own/range_m.npy"]
 
 
 def test_labels_of_another_time_stamp_are_not_taken(tmp_path):

@@ -214,6 +214,10 @@ def test_foreign_data_are_left_alone(tmp_path):
     with pytest.raises(ValueError, match=r"was not simulated"):
         simulate(tmp_path, 2, **SMALL)
     assert not (tmp_path / "simulation.json").exists()
+    (tmp_path / "own").mkdir()
+    (tmp_path / "own" / "000000.bin").write_bytes(bytes(16))
+    with pytest.raises(ValueError, match=r"holds scans that were not simulated, such as 000000\.b"):
+        simulate(tmp_path / "own", 2, **SMALL)
     file = tmp_path / "file"
     file.write_text("")
     with pytest.raises(ValueError, match="is a file"):

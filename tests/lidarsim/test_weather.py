@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch.utils.data import DataLoader, Dataset
 
-from lidarsim import Origin, Street, load_sensor, simulate_scan
+from lidarsim import Origin, Simulator, Street, load_sensor, simulate_scan
 from lidarsim.clouds import PointCloud, read_cloud
 from lidarsim.draws import Draws
 from lidarsim.effects import EFFECTS, medium
@@ -470,3 +470,14 @@ def test_second_returns_are_apart_from_the_first(scan):
         nearest_m.append(np.abs(np.diff(range_m)[is_pair]).min())
     # From the optical centre and from the origin, distances differ by some centimetres.
     assert min(nearest_m) > SECOND_RETURN_M - 0.05
+
+
+def test_a_simulated_scan_is_changed_as_a_recorded_one():
+    scan = Simulator(seed=0, sensor="vlp16").scan(0)
+    assert len(repr(scan)) < 1000
+    found = Weather(visibility_m=60).apply(scan)
+    points, intensity = scan.points[:, :3], scan.points[:, 3]
+    recorded = RecordedScan(points, intensity, labels=scan.labels)
+    expected = Weather(visibility_m=60).apply(recorded)
+    np.testing.assert_array_equal(found.points, expected.points)
+    np.testing.assert_array_equal(found.labels, expected.labels)

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarsim.cloud_formats import ODD_SHARE
-from lidarsim.clouds import find_files
 from lidarsim.ground import ground_around, plane_of
 from lidarsim.io import number_of
+from lidarsim.scan_folders import find_files
 from lidarsim.sensors.beams import MORE_THAN_A_TURN, BeamFit, ColumnFit, fit_beams, fit_columns
 from lidarsim.sensors.files import SensorFile, write_sensor
 from lidarsim.sensors.recordings import (

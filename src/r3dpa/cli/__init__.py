@@ -75,7 +75,8 @@ def _help(group: str) -> str:
     shown = {name: command for name, command in COMMANDS.items() if name.startswith(group)}
     lines = [f"  {name:<17}{command.summary}" for name, command in shown.items()]
     title = [] if group else ["Generate LiDAR scenes (R3DPA).", ""]
-    end = "r3dpa COMMAND --help lists the options. `data` and `edit` may be left out.\n"
+    end = "r3dpa COMMAND --help lists the options. `data` and `edit` may be left out, but for\n"
+    end += "`data convert`, since `convert` is a command of its own.\n"
     end += "--allow_import PACKAGE lets a configuration name classes of a package that you trust."
     usage = " ".join(filter(None, ("usage: r3dpa", group, "COMMAND [options]")))
     return "\n".join([usage, "", *title, *lines, "", end])

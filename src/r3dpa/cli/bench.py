@@ -85,7 +85,7 @@ def sampling(
         "nfe": nfe,
         "reference_steps": reference_steps,
     }
-    given = [f"--{name}" for name, value in options.items() if value is not None]
+    given = ["--num" if n == "scenes" else f"--{n}" for n, v in options.items() if v is not None]
     if given and ckpt is None:
         raise ValueError(f"{', '.join(given)}: for a model, give --ckpt, such as r3dpa-s")
     from r3dpa.bench.sampling import sampling as measure

@@ -31,7 +31,8 @@ def check(folder: Path, *, columns: tuple[str, ...] = ()) -> None:
             inferred from the values.
     """
     from lidarsim.cloud_formats import READABLE
-    from lidarsim.clouds import files_below, find_files, read_cloud, suffix_of
+    from lidarsim.clouds import read_cloud, suffix_of
+    from lidarsim.scan_folders import files_below, find_files
 
     if not folder.exists():  # said before torch is imported
         sys.stdout.write(f"bad: {folder}: is no folder and no file; can be read: {READABLE}\n")
@@ -225,7 +226,8 @@ def sensor(scans: Path, *, out: Path, num: PositiveInt = 30) -> str:
     import numpy as np
     import torch
 
-    from lidarsim.clouds import find_files, read_cloud
+    from lidarsim.clouds import read_cloud
+    from lidarsim.scan_folders import find_files
     from lidarsim.sensors import estimate
     from r3dpa import viz
     from r3dpa.data.scans import evenly

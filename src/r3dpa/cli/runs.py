@@ -74,6 +74,11 @@ def report(run: Path) -> str:
     from r3dpa.io import text_table
 
     curves = viz.read_curves(run)
+    if not curves and (run / "config.yaml").is_file():
+        raise ValueError(
+            f"{run} has no logged values yet: a run logs every --trainer.log_every_n_steps steps "
+            "(see its config.yaml), and had fewer"
+        )
     if not curves:
         raise ValueError(f"{run} holds no version_*/metrics.csv; give the --run_dir of a fit")
     drawn = {name: curve for name, curve in curves.items() if len(curve[1]) > 1}

@@ -46,6 +46,11 @@ def weather(
             "no weather is given, so that scans would stay as they are: give an option such as "
             "--weather.visibility_m 60 or --weather.rain_mm_h 10"
         )
+    if weather.traffic_m_s and not weather.water_film_mm:
+        raise ValueError(
+            f"--weather.traffic_m_s {weather.traffic_m_s:g} throws up spray on a wet road only: "
+            "give --weather.water_film_mm too, such as 1"
+        )
     change = partial(weather.apply, instrument=instrument, effects=effects)
     # An error in the request must not be reported as one in the first scan.
     change(RecordedScan(np.ones((1, 3), np.float32)), 0)

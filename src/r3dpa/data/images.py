@@ -20,7 +20,7 @@ from PIL import Image
 from torch import Tensor
 
 from lidarsim.cloud_formats import DataError
-from lidarsim.clouds import files_below
+from lidarsim.scan_folders import files_below
 from r3dpa.data.store import ItemKey
 from r3dpa.geometry import LidarSensor
 from r3dpa.io import first_line, refuse_name

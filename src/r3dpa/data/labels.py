@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lidarsim.cloud_formats import ScanError, read_bytes
-from lidarsim.scan_files import read_beside
+from lidarsim.clouds import PointCloud, label_path_of
 from r3dpa.io import atomic_path
 
 #: Names by KITTI-360 class id; every other id counts as unlabelled.
@@ -88,10 +88,11 @@ _SEMANTIC_KITTI = {0: 0, 1: 0} | {
 
 
 def read_labels(scan: str | Path, num_points: int) -> NDArray[np.int64]:
-    """Class and object of each of the P points of a ``.bin`` scan, from the file beside it.
+    """Class and object of each of the P points of a scan, from the ``.label`` file beside it.
 
-    ``velodyne_points/labels/F.label`` of KITTI-360, as ``r3dpa data simulate`` writes them, for
-    ``velodyne_points/data/F.bin``; ``labels/F.label`` of SemanticKITTI for ``velodyne/F.bin``.
+    The file lies in the folder of the scan, in ``labels`` there, or in ``labels`` beside the
+    folder, as `r3dpa data simulate` and `r3dpa sample` write it. Beside a folder ``velodyne`` it
+    holds classes of SemanticKITTI, which become classes of KITTI-360.
 
     Returns:
         ``(P,)`` KITTI-360 class in the lower 16 bits, see :data:`CLASS_NAMES`, 0 without a label;
@@ -99,10 +100,11 @@ def read_labels(scan: str | Path, num_points: int) -> NDArray[np.int64]:
     """
     labels = find_labels(scan, num_points)
     if labels is None:
+        scan = Path(scan)
         raise ScanError(
-            f"{scan} has no labels: looked for labels/{Path(scan).stem}.label beside its folder, "
-            "velodyne_points/data as KITTI-360 and `r3dpa data simulate` have it, or velodyne as "
-            "SemanticKITTI"
+            f"{scan} has no labels: looked for {scan.stem}.label in its folder, and in folders "
+            "labels there and beside it, as KITTI-360, SemanticKITTI and `r3dpa data simulate` "
+            "have them"
         )
     return labels
 
@@ -110,13 +112,30 @@ def read_labels(scan: str | Path, num_points: int) -> NDArray[np.int64]:
 def find_labels(scan: str | Path, num_points: int) -> NDArray[np.int64] | None:
     """Labels ``(P,)`` as of :func:`read_labels`; None for a scan without a label file."""
     scan = Path(scan)
-    simulated = read_beside(scan, "labels")
-    if simulated is not None:
-        return simulated.astype(np.int64)
-    path = scan.absolute().parent.parent / "labels" / f"{scan.stem}.label"
-    if scan.parent.name == "velodyne" and path.exists():
-        return _semantic_kitti(path, num_points)
-    return None
+    path = label_path_of(scan)
+    if path is None:
+        return None
+    data = read_bytes(path)
+    if len(data) != 4 * num_points:
+        raise ScanError(f"{path} holds {len(data) / 4:g} labels, but its scan {num_points} points")
+    return _kitti_360(np.frombuffer(data, dtype="<u4"), scan)
+
+
+def labels_of_cloud(cloud: PointCloud) -> NDArray[np.int64] | None:
+    """Labels ``(P,)`` as of :func:`read_labels` of a scan that was read; None without labels."""
+    if cloud.labels is None or cloud.file is None:
+        return None if cloud.labels is None else cloud.labels.astype(np.int64)
+    return _kitti_360(cloud.labels, cloud.file.path)
+
+
+def classes_as_of_cloud(classes: NDArray[np.int64], cloud: PointCloud) -> NDArray[np.int64]:
+    """KITTI-360 classes ``(P,)`` by the ids that the labels of a cloud have; 0 for unknown ones."""
+    if cloud.file is None or not _has_semantic_kitti(cloud.file.path):
+        return classes
+    table = np.zeros(1 << 16, np.int64)
+    for name, numbers in _SEMANTIC_KITTI_IDS.items():
+        table[_ID_OF[name]] = numbers[0]
+    return table[classes]
 
 
 def write_labels(path: str | Path, labels: Tensor) -> None:
@@ -125,15 +144,25 @@ def write_labels(path: str | Path, labels: Tensor) -> None:
         temporary.write_bytes(labels.numpy().astype("<u4").tobytes())
 
 
-def _semantic_kitti(path: Path, num_points: int) -> NDArray[np.int64]:
-    data = read_bytes(path)
-    if len(data) != 4 * num_points:
-        raise ScanError(f"{path} holds {len(data) / 4:g} labels, but its scan {num_points} points")
-    labels = np.frombuffer(data, dtype="<u4").astype(np.int64)
+def _kitti_360(labels: NDArray[np.uint32], scan: Path) -> NDArray[np.int64]:
+    """Labels with classes of KITTI-360 of those in the file beside a scan."""
+    numbers = labels.astype(np.int64)
+    if not _has_semantic_kitti(scan):
+        return numbers
     table = np.full(1 << 16, -1)
     table[list(_SEMANTIC_KITTI)] = list(_SEMANTIC_KITTI.values())
-    classes = table[labels & 0xFFFF]
+    classes = table[numbers & 0xFFFF]
     if (classes < 0).any():
-        unknown = sorted(set((labels[classes < 0] & 0xFFFF).tolist()))
-        raise ScanError(f"{path} holds {unknown[:5]}, which are no classes of SemanticKITTI")
-    return classes | labels >> 16 << 16
+        unknown = sorted(set((numbers[classes < 0] & 0xFFFF).tolist()))
+        raise ScanError(
+            f"{label_path_of(scan)} holds {unknown[:5]}, which are no classes of SemanticKITTI"
+        )
+    return classes | numbers >> 16 << 16
+
+
+def _has_semantic_kitti(scan: Path) -> bool:
+    """Whether the label file of a scan lies where SemanticKITTI has it."""
+    folder, path = scan.absolute().parent, label_path_of(scan)
+    return (
+        folder.name == "velodyne" and path is not None and path.parent == folder.parent / "labels"
+    )

@@ -36,8 +36,8 @@ import torch
 from torch import Tensor
 
 from lidarsim.cloud_formats import ScanError, is_one_cloud, npz_arrays
-from lidarsim.clouds import files_below
 from lidarsim.scan_files import out_of_range, read_points, read_scan
+from lidarsim.scan_folders import files_below
 from r3dpa.data.scans import find_scans
 from r3dpa.geometry import EMPTY_RANGE_M, LidarSensor, SphericalProjection, in_range, points_of
 from r3dpa.io import UNPICKLING_ERRORS, first_line

@@ -16,8 +16,9 @@ from tqdm import tqdm
 
 from lidarsim import TRAIN_DRIVES, VAL_DRIVES, drive_name, expected_scans
 from lidarsim.cloud_formats import READABLE, READERS, ScanError, unreadable
-from lidarsim.clouds import files_below, find_files, read_cloud, suffix_of
+from lidarsim.clouds import read_cloud, suffix_of
 from lidarsim.scan_files import read_scan, rows_of
+from lidarsim.scan_folders import files_below, find_files, without_range_images
 from r3dpa.data.store import ItemKey
 from r3dpa.geometry import LidarSensor
 from r3dpa.io import number_of, refuse_name
@@ -87,8 +88,9 @@ def find_scans(
     files = sorted(file.absolute() for entry in entries for file in scan_files(entry))
     if not files:
         raise ValueError(
-            f"no scan found in {', '.join(str(e) for e in given)}: give a folder of scans, a scan, "
-            f"a glob such as 'drives/**/*.bin', or a list of these; can be read: {READABLE}"
+            f"no scan found in {', '.join(str(e) for e in given)}: give a scan or a folder of "
+            "scans (in Python and in YAML files also a glob such as 'drives/**/*.bin', or a list "
+            f"of these); can be read: {READABLE}"
         )
     twice = [str(file) for file, count in Counter(files).items() if count > 1]
     if twice:
@@ -146,10 +148,7 @@ def scan_files(entry: str | Path) -> Iterator[Path]:
         for drive in (path / RAW).iterdir():
             yield from _drive_files(drive)
     elif path.is_dir():
-        files: Iterable[Path] = files_below(path)
-        if (path / "metadata.json").is_file():  # scenes of r3dpa, with range images beside clouds
-            files = [file for file in files if file.name not in ("range_m.npy", "before.npy")]
-        yield from _of_one_format(path, files)
+        yield from _of_one_format(path, without_range_images(list(files_below(path))))
     elif path.is_file():
         yield path
     elif has_magic(str(entry)):

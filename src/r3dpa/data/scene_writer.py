@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lidarsim.clouds import READERS, suffix_of
 from lidarsim.scan_files import write_bin, write_npz, write_ply
 from r3dpa.data.labels import write_labels
 from r3dpa.geometry import points_of, values_at_returns
@@ -188,14 +189,24 @@ class SceneWriter:
             raise ValueError(
                 f"{self.out} holds scenes already; give another --out or --overwrite true"
             )
-        stored = {key: metadata.get(key) for key in self._request} | {"num": self.num}
-        if different := "; ".join(differences(stored, self._request)):
+        stored = {key: metadata.get(key) for key in self._request}
+        if different := self._differences(stored):
             raise ValueError(
                 f"{self.out} holds {num_done} scenes of another request ({different}); give "
                 "another --out or --overwrite true"
             )
         self._start_journal(num_done, round(nfe * num_done))
         metadata_path.unlink()
+
+    def _differences(self, stored: dict[str, Any], with_num: bool = False) -> str:
+        """How a stored request differs in what scenes depend on; not on how many are made at once.
+
+        Their number counts only ``with_num``: scenes can be added.
+        """
+        free = {"batch_size"} if with_num else {"batch_size", "num"}
+        request = {name: value for name, value in self._request.items() if name not in free}
+        before = {name: value for name, value in stored.items() if name not in free}
+        return "; ".join(differences(before, request))
 
     def _written_before(self) -> tuple[int, int]:
         try:
@@ -206,9 +217,8 @@ class SceneWriter:
             raise ValueError(
                 f"{self._journal.path}: is damaged ({error!r}); give --overwrite true to start anew"
             ) from error
-        if "num" in stored and num_done <= self.num:
-            stored["num"] = self.num  # scenes are added
-        if num_done and (different := "; ".join(differences(stored, self._request))):
+        fewer_wanted = num_done > self.num
+        if num_done and (different := self._differences(stored, with_num=fewer_wanted)):
             raise ValueError(
                 f"{self.out} holds {num_done} scenes of an unfinished run of another request "
                 f"({different}); the same request completes it, --overwrite true starts anew"
@@ -221,6 +231,11 @@ class SceneWriter:
     def _clear(self) -> None:
         """Remove the output of earlier runs, and nothing else."""
         metadata = self.out / "metadata.json"
+        for file in self.out.glob("[!.]*"):
+            if file.name not in _WRITTEN and suffix_of(file) in READERS:
+                raise ValueError(
+                    f"{file} is a scan that is none of these scenes: give another --out"
+                )
         for name in _WRITTEN:
             if (self.out / name).is_symlink():
                 raise ValueError(f"{self.out / name} is a link: remove it, or give another --out")

@@ -221,7 +221,10 @@ class ReferenceStatistics:
             raise ValueError(f"{path} is a folder; give the file that `r3dpa data reference` wrote")
         try:
             with safe_open(path, framework="pt") as file:
-                card = json.loads(file.metadata()[_ABOUT])
+                about = (file.metadata() or {}).get(_ABOUT)
+                if about is None:
+                    raise ValueError("it has no metadata of one")
+                card = json.loads(about)
                 tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - no dict
             if card["version"] != _VERSION:
                 raise ValueError(f"is of version {card['version']}, this is {_VERSION}")

@@ -14,10 +14,11 @@ import numpy as np
 from tqdm import tqdm
 
 from lidarsim.changed_scans import inputs_of, refuse_outside, refuse_shared_labels, write_below
-from lidarsim.clouds import PointCloud, find_files, read_cloud
+from lidarsim.clouds import PointCloud, read_cloud
 from lidarsim.drive_files import to_json, write
 from lidarsim.recorded import RecordedScan
 from lidarsim.scan_files import ScanError
+from lidarsim.scan_folders import find_files
 from lidarsim.weather import WeatheredScan, changed_cloud, recorded_scan
 from r3dpa.io import (
     Journal,

@@ -16,7 +16,9 @@ from torch import Tensor
 from tqdm import tqdm
 
 from lidarsim.changed_scans import write_below
-from lidarsim.clouds import PointCloud, find_files, read_cloud
+from lidarsim.clouds import PointCloud, read_cloud
+from lidarsim.scan_folders import find_files
+from r3dpa.data.labels import classes_as_of_cloud
 from r3dpa.data.scene_writer import SceneWriter
 from r3dpa.editing import EditResult
 from r3dpa.editing.editor import COMPLETION_START
@@ -218,8 +220,8 @@ def _completed_cloud(
     if labels is not None:
         added_labels = np.zeros(len(added), labels.dtype)
         if result.labels is not None:
-            classes = values_at_returns(result.labels[index], range_m, projection)
-            added_labels = classes.numpy().astype(labels.dtype)
+            classes = values_at_returns(result.labels[index], range_m, projection).numpy()
+            added_labels = classes_as_of_cloud(classes, cloud).astype(labels.dtype)
         labels = np.concatenate([labels, added_labels])
     rows = np.concatenate([np.arange(len(cloud)), nearest])
     return cloud.changed(rows, np.concatenate([points, added]), intensity, labels)

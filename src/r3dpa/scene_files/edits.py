@@ -20,7 +20,7 @@ from r3dpa import viz
 from r3dpa.checkpoints import read_checkpoint
 from r3dpa.data import PointSample, Scan, ScanError, pooled_grids
 from r3dpa.data.images import read_mask
-from r3dpa.data.labels import find_labels
+from r3dpa.data.labels import find_labels, labels_of_cloud
 from r3dpa.data.scene_writer import SceneWriter
 from r3dpa.editing import EditResult, EditSettings, SceneEditor
 from r3dpa.editing.gaps import check_view
@@ -125,11 +125,10 @@ class EditSession:
         Points above and below the field of view, which would land in the first and last row, are in
         no pixel.
         """
-        points, labels = torch.from_numpy(cloud.rows()), None
+        points, known = torch.from_numpy(cloud.rows()), labels_of_cloud(cloud)
         if not in_range(points[:, :3], self.sensor).any():
             raise out_of_range(path, self.sensor)
-        if cloud.labels is not None:
-            labels = torch.from_numpy(cloud.labels.astype(np.int64))
+        labels = None if known is None else torch.from_numpy(known)
         outside = ~in_view(points[:, :3], self.projection)
         seen = points.masked_fill(outside[:, None], torch.nan)
         return ScanView(path, points, project_pixels(seen, self.projection, labels))
