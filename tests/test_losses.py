@@ -11,7 +11,6 @@ from r3dpa.losses import (
     balanced_generator_loss,
     centred_features,
     discriminator_loss,
-    energy_score,
     flow_matching_loss,
     generator_loss,
     reconstruction_loss,
@@ -177,28 +176,3 @@ def test_large_and_small_features_have_the_cosine_of_their_directions(dtype):
         assert gradient_of(alignment_loss, scaled, grid).isfinite().all()
     square = (projected * scales[-1 if dtype != torch.float16 else 0]).square().sum(dim=-1)
     assert square.isinf().all()
-
-
-def test_energy_score_by_hand():
-    """Vectors over the channels; of the second image, one position counts."""
-    target = torch.zeros(2, 2, 1, 2)
-    first, second = target.clone(), target.clone()
-    first[0, :, 0, 0] = torch.tensor([3.0, 4])  # 5 from the target, 10 from the other sample
-    second[0, :, 0, 0] = torch.tensor([-3.0, -4])
-    first[1, 0, 0, 1] = second[1, 0, 0, 1] = 2.0  # 2 from the target, 0 from each other
-    mask = torch.ones(2, 2, 1, 2, dtype=torch.bool)
-    mask[1, :, :, 0] = False
-    found = energy_score(first, second, target, mask)
-    torch.testing.assert_close(found, torch.tensor([0.0, 2.0]), atol=1e-3, rtol=0)
-    mask[1, 0, 0, 1] = False  # of the vector, the channel that differs does not count
-    assert energy_score(first, second, target, mask)[1] < 1e-3
-
-
-@pytest.mark.parametrize("spread", [0.0, 0.5, 2.0])
-def test_energy_score_is_smallest_for_the_right_spread(spread):
-    generator = torch.Generator().manual_seed(0)
-    target, *samples = torch.randn(3, 1, 2, 300, 300, generator=generator)
-    mask = torch.ones_like(target, dtype=torch.bool)
-    right = energy_score(*samples, target, mask)
-    wrong = energy_score(*(spread * sample for sample in samples), target, mask)
-    assert wrong > right + 0.02

@@ -103,9 +103,9 @@ def test_a_batch_that_is_filled_up_holds_the_same_scenes(sampler):
     """Bitwise: the networks see the same shape, and what fills it does not matter."""
     scenes = SceneGenerator(*tiny_networks(), GEOMETRY, sampler, batch_size=5)
     shapes = set()
-    velocity_at, draw = scenes.sit.velocity_at, scenes._draw
+    velocity_at, decode = scenes.sit.velocity_at, scenes._decode
     scenes.sit.velocity_at = lambda x, row: shapes.add(("sit", len(x))) or velocity_at(x, row)
-    scenes._draw = lambda x, noise: shapes.add(("vae", len(x))) or draw(x, noise)
+    scenes._decode = lambda x: shapes.add(("vae", len(x))) or decode(x)
     whole = scenes.generate(range(5), seed=1)
     part = scenes.generate(range(3), seed=1)
     assert torch.equal(part.latents, whole.latents[:3])

@@ -122,7 +122,7 @@ class SceneGenerator:
         self._strong = ScheduledVelocity(self.sit, compile, graphs, guidance)
         self._weak = None if weak is None else ScheduledVelocity(weak, compile, graphs)
         self._autoguidance = autoguidance
-        self._draw = torch.compile(self.vae.draw, dynamic=False) if compile else self.vae.draw
+        self._decode = torch.compile(self.vae.decode, dynamic=False) if compile else self.vae.decode
         self._velocity: Velocity = self._strong
         self._prepared: tuple[SamplerConfig, torch.device] | None = None
 
@@ -250,7 +250,7 @@ class SceneGenerator:
         if self._weak is not None:
             self._weak.sit.to(device)
         self._use_channels_last_on_gpu()
-        self._draw = self.vae.draw
+        self._decode = self.vae.decode
         return self
 
     def with_sampler(self, sampler: SamplerConfig) -> SceneGenerator:
@@ -343,8 +343,7 @@ class SceneGenerator:
         """Ranges of normalised latents, and intensities and classes where the VAE has them.
 
         Scenes with numbers ``indices`` of the collection ``seed`` get back what a VAE does not
-        encode. A texture draws it, see :class:`r3dpa.nn.texture.Texture`. Without a texture, where
-        images have a return channel, they lose single returns at random, see
+        encode: where images have a return channel, they lose single returns at random, see
         :meth:`r3dpa.geometry.RangeCodec.drop_returns`, and where the decoder smooths ranges along
         rings (two modes), they have range noise of 1 cm, as scans have.
 
@@ -364,22 +363,16 @@ class SceneGenerator:
         sensor, codec, parts = self.geometry.projection.sensor, self.geometry.codec, []
         for first in range(0, len(latents), size):
             part = self.latent_norm.denormalise(latents[first : first + size].float())
-            numbers = None if indices is None else indices[first : first + size]
-            noise = None
-            if numbers is not None and self.vae.texture:
-                noise_size = self.vae.noise_size((sensor.beams, sensor.columns))
-                noise = scene_normal((noise_size,), numbers, seed).to(part.device)
-                noise = pad_batch(noise, size)
-            image = self._draw(pad_batch(part, size), noise)[: len(part)].float()
+            image = self._decode(pad_batch(part, size))[: len(part)].float()
             finite = image.flatten(1).isfinite().all(dim=1)
-            without_noise = None if self.vae.texture else numbers
-            if without_noise is not None and codec.return_channel:
-                uniform = scene_uniform(image.shape[2:], without_noise, seed)
+            numbers = None if indices is None else indices[first : first + size]
+            if numbers is not None and codec.return_channel:
+                uniform = scene_uniform(image.shape[2:], numbers, seed)
                 image = codec.drop_returns(image, uniform.to(image.device))
             pixels = codec.pixels_of(image, sensor)
             range_m = pixels.range_m
-            if without_noise is not None and self.vae.modes == 2:
-                range_m = self._with_noise(range_m, without_noise, seed)
+            if numbers is not None and self.vae.modes == 2:
+                range_m = self._with_noise(range_m, numbers, seed)
             range_m = torch.where(finite[:, None, None], range_m, torch.nan)
             parts.append(pixels._replace(range_m=range_m))
         joined: list[Any] = [
@@ -475,7 +468,7 @@ def _check_average(
 
 def pad_batch(values: Tensor, size: int) -> Tensor:
     """``(B, C, h, w)`` with zeros up to ``size`` samples."""
-    return F.pad(values, (0, 0) * (values.ndim - 1) + (0, size - len(values)))
+    return F.pad(values, (0, 0, 0, 0, 0, 0, 0, size - len(values)))
 
 
 def scene_indices(indices: int | Sequence[int]) -> Sequence[int]:

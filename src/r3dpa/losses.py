@@ -11,15 +11,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-_LEAST_SQUARE = 1e-6  # keeps the gradient of a distance of 0 finite
-
 __all__ = [
     "alignment_loss",
     "balanced_generator_loss",
     "centred_features",
     "class_errors",
     "discriminator_loss",
-    "energy_score",
     "flow_matching_loss",
     "generator_loss",
     "masked_mean",
@@ -94,38 +91,6 @@ def class_errors(logits: Tensor, classes: Tensor) -> Tensor:
     numbers = classes[:, 0].long()
     each = F.cross_entropy(logits.float(), numbers.clamp(min=-1), ignore_index=-1, reduction="none")
     return each.unsqueeze(1)
-
-
-def energy_score(first: Tensor, second: Tensor, target: Tensor, mask: Tensor) -> Tensor:
-    """Energy score of a distribution that two samples were drawn from; smallest if it is right.
-
-    Formula, with samples x, x' and the truth y, vectors over the channels at each position::
-
-        (|x - y| + |x' - y|) / 2 - |x - x'| / 2
-
-    The first part pulls both samples to the truth, the second keeps them as far from each other as
-    the truth varies. For one channel this is the continuous ranked probability score.
-
-    Source: Gneiting and Raftery, "Strictly proper scoring rules, prediction, and estimation" (JASA
-    2007).
-
-    Args:
-        first: ``(B, C, h, w)``.
-        second: Likewise.
-        target: Likewise.
-        mask: ``(B, C, h, w)`` bool: elements that count.
-
-    Returns:
-        ``(B,)``, float32: means over the positions where anything counts.
-    """
-
-    def distance(a: Tensor, b: Tensor) -> Tensor:
-        difference = torch.where(mask, a.float() - b.float(), 0.0)
-        return (difference.square().sum(dim=1, keepdim=True) + _LEAST_SQUARE).sqrt()
-
-    to_target = distance(first, target) + distance(second, target)
-    score = (to_target - distance(first, second)) / 2
-    return masked_mean(score, mask.any(dim=1, keepdim=True))
 
 
 def generator_loss(fake_logits: Tensor) -> Tensor:

@@ -59,7 +59,6 @@ R3DPA_S_2 = {
     "decoder": ("vae_alignment", "vae_decoder"),
     "decoder_labels": ("vae_alignment", "decoder_labels"),
     "perceptual": ("vae_alignment", "decoder_labels", "perceptual"),
-    "texture": ("vae_alignment", "texture"),
     "flow": ("teacher", "flow_matching"),
     "aligned": ("teacher", "flow_matching", "aligned"),
     "readout": ("teacher", "flow_matching", "readout"),
@@ -229,7 +228,7 @@ def test_the_second_edition_of_r3dpa_s_starts(name, start, tmp_path):
     if name.startswith("vae"):
         later = ("intensity", "num_classes", "refinement")
         vae = {key: value for key, value in vae.items() if key not in later}
-    if name in ("decoder_labels", "perceptual", "texture", "aligned"):
+    if name in ("decoder_labels", "perceptual", "aligned"):
         vae["encode_further"] = False
     channels = {} if name.startswith("vae") else {"intensity_channel": True, "num_classes": 15}
     codec = RangeCodec("log2", return_channel=True, **channels)

@@ -128,7 +128,7 @@ def test_the_end_that_held_out_errors_compare_with_is_guided(monkeypatch):
     module.thin_decoder = None
     noise = module.solve([0])[:, 0]
     monkeypatch.setattr(few_step, "average_velocity_steps", lambda _, x, grid: 0 * x)
-    errors = module.held_out_errors({}, noise, noise, PathDraws(noise, torch.zeros(1), noise))
+    errors = module.held_out_errors(noise, noise, PathDraws(noise, torch.zeros(1), noise))
     end = module.solve([0])[:, -1]
     torch.testing.assert_close(errors["endpoint_1"], end.square().mean(dim=(1, 2, 3)))
 
@@ -179,8 +179,7 @@ def test_held_out_errors_by_hand(monkeypatch):
     range_m[:, :2] = -1
     module.thin_decoder.decode = lambda _: codec.encode(range_m)[:, None]
     latents = torch.randn(2, 4, 4, 8)
-    draws = PathDraws(latents, None, latents)
-    errors = module.held_out_errors({}, reconstruction, latents, draws)
+    errors = module.held_out_errors(reconstruction, latents, PathDraws(latents, None, latents))
     assert errors["endpoint_1"].tolist() == errors["endpoint_4"].tolist() == [9, 9]
     assert torch.equal(times[0], ode_times(16, shift=TIME_SHIFT))
     count, either = errors["thin_return_iou"]

@@ -22,7 +22,7 @@ Result = Literal["kept", "fresh", "resized", "truncated", "dropped"]
 NORM_TOLERANCE = 0.05
 _NORM = "latent_norm."
 _PROJECTOR = "projector."
-_OPTIONAL_PARTS = ("refinement", "texture")  # of a decoder, each in a layer of its own
+_REFINEMENT = "further_refinement."
 
 
 class TransferRow(NamedTuple):
@@ -98,7 +98,7 @@ def transfer_rgb(
 
 
 def with_further_channels(checkpoint: Checkpoint, vae: VAE) -> Checkpoint:
-    """Checkpoint of a VAE with the intensity, class and other parts that ``vae`` has and it lacks.
+    """Checkpoint of a VAE with the intensity, class and refinement that ``vae`` has and it lacks.
 
     The layers of these parts have the values that they have in ``vae``, all others stay: the
     encoder gives the same latents, and the decoder the same ranges and returns. Unchanged where the
@@ -114,14 +114,13 @@ def with_further_channels(checkpoint: Checkpoint, vae: VAE) -> Checkpoint:
 
 
 def without_further_channels(checkpoint: Checkpoint, vae: VAE) -> Checkpoint:
-    """Checkpoint whose VAE has no refinement, texture, intensity and class that ``vae`` lacks.
+    """Checkpoint whose VAE has no refinement, intensity and class that ``vae`` lacks.
 
     All else stays. Intensity and class are left out together, and stay where the encoder sees them:
     without, its latents would be others.
     """
-    for name in _OPTIONAL_PARTS:
-        if not getattr(vae, name):
-            checkpoint = _without_part(checkpoint, name)
+    if not vae.refinement:
+        checkpoint = _without_refinement(checkpoint)
     weights = checkpoint.network("vae").state_dict
     rest = {key: value for key, value in weights.items() if ".further_" not in key}
     encoded = any(key.startswith("encoder.further_") for key in weights)
@@ -130,20 +129,19 @@ def without_further_channels(checkpoint: Checkpoint, vae: VAE) -> Checkpoint:
     return _with_channels_of(checkpoint, vae, rest)
 
 
-def _without_part(checkpoint: Checkpoint, name: str) -> Checkpoint:
+def _without_refinement(checkpoint: Checkpoint) -> Checkpoint:
     state = checkpoint.network("vae")
-    layer = f"further_{name}."
-    rest = {key: value for key, value in state.state_dict.items() if layer not in key}
+    rest = {key: value for key, value in state.state_dict.items() if _REFINEMENT not in key}
     if len(rest) == len(state.state_dict):
         return checkpoint
-    plain = replace(state, init_args={**state.init_args, name: 0}, state_dict=rest)
+    plain = replace(state, init_args={**state.init_args, "refinement": 0}, state_dict=rest)
     return replace(checkpoint, networks={**checkpoint.networks, "vae": plain})
 
 
 def _with_channels_of(checkpoint: Checkpoint, vae: VAE, weights: Weights) -> Checkpoint:
     """Checkpoint with these weights of a VAE, and the parts beside ranges that ``vae`` has."""
     state = checkpoint.network("vae")
-    further = ("intensity", "num_classes", "encode_further", *_OPTIONAL_PARTS)
+    further = ("intensity", "num_classes", "encode_further", "refinement")
     init_args = {**state.init_args, **{name: getattr(vae, name) for name in further}}
     changed = replace(state, init_args=init_args, state_dict=weights)
     geometry = checkpoint.geometry

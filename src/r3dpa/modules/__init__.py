@@ -1,7 +1,6 @@
 """Training stages and feature extraction as LightningModules."""
 
 from r3dpa.modules.base import GenerativeModule
-from r3dpa.modules.decoder_texture import DecoderTexture
 from r3dpa.modules.feature_extraction import FeatureExtraction
 from r3dpa.modules.few_step import FewStep
 from r3dpa.modules.flow_matching import FlowMatching
@@ -14,7 +13,6 @@ from r3dpa.modules.settings import LossWeights, OptimizerConfig
 from r3dpa.modules.vae_alignment import VAEAlignment
 
 __all__ = [
-    "DecoderTexture",
     "FeatureExtraction",
     "FewStep",
     "FlowMatching",

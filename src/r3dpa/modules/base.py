@@ -444,13 +444,13 @@ class GenerativeModule(Stage):
                 mask.flatten(1).sum(dim=1),
             ),
             **values,
-            **self.held_out_errors(batch, prediction, posterior.mean, draws),
+            **self.held_out_errors(reconstruction, posterior.mean, draws),
         )
 
     def held_out_errors(
-        self, batch: LidarBatch, prediction: Tensor, latents: Tensor, draws: PathDraws
+        self, reconstruction: Tensor, latents: Tensor, draws: PathDraws
     ) -> dict[str, Tensor | tuple[Tensor, Tensor]]:
-        """Further values of held-out scans ``(B,)``, by outputs of the decoder and raw latents."""
+        """Further values of held-out scans ``(B,)``, by the reconstruction and its raw latents."""
         return {}
 
     test_step = validation_step

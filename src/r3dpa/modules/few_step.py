@@ -246,7 +246,7 @@ class FewStep(FlowMatching):
         return x + per_sample(target - time, x) * slope.to(x)
 
     def held_out_errors(
-        self, batch: LidarBatch, prediction: Tensor, latents: Tensor, draws: PathDraws
+        self, reconstruction: Tensor, latents: Tensor, draws: PathDraws
     ) -> dict[str, Tensor | tuple[Tensor, Tensor]]:
         """Squared distance of 1 and 4 average steps from the end of AB3; errors of the decoder."""
         sit = cast(AverageVelocitySiT, (self.ema or self).sit)
@@ -256,8 +256,7 @@ class FewStep(FlowMatching):
             reached = average_velocity_steps(sit.average_velocity, draws.noise, average_times(num))
             errors[f"endpoint_{num}"] = losses.flow_matching_loss(reached, end)
         if self.thin_decoder is not None:
-            thin = self.thin_decoder.decode(latents)
-            errors |= self._thin_decoder_errors(self.vae.image_of(prediction), thin)
+            errors |= self._thin_decoder_errors(reconstruction, self.thin_decoder.decode(latents))
         return errors
 
     def _thin_decoder_errors(

@@ -29,7 +29,6 @@ class LossWeights:
         kl: Weight of the Kullback-Leibler term, summed per sample.
         perceptual: Weight of the distance between what a network on points sees in reconstruction
             and scan, see :class:`r3dpa.modules.perceptual.PerceptualLoss`.
-        texture: Weight of the energy score of drawn images, of stage decoder_texture.
         adversarial: Weight of the generator's adversarial loss (official 0.3 x 0.001).
         adversarial_ratio: Target ratio of adversarial to L1 gradient norm at the image (adaptive
             weight of VQGAN), in place of ``adversarial`` where that is not 0. Default: fixed
@@ -61,7 +60,6 @@ class LossWeights:
     classes: float = 0.2
     kl: float = 1e-6
     perceptual: float = 0.0
-    texture: float = 1.0
     adversarial: float = 3e-4
     adversarial_ratio: float | None = None
     discriminator: float = 1e-3

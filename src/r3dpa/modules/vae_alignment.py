@@ -37,7 +37,7 @@ class VAEAlignment(GenerativeModule):
     """
 
     stage = "vae_alignment"
-    default_init: tuple[str, ...] = ("vae",)
+    default_init = ("vae",)
     trains_velocity = False
 
     def __init__(

@@ -115,7 +115,6 @@ class Decoder(nn.Module):
         self.conv_out = Float32CircularConv2d(first, out_channels * math.prod(stem), kernel)
         self.further_out: nn.Module | None = None
         self.further_refinement: nn.Module | None = None
-        self.further_texture: nn.Module | None = None  # called by VAE.draw_image
         if further:
             self.further_out = Float32CircularConv2d(first, further * math.prod(stem), (1, 1))
 

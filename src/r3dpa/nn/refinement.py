@@ -14,9 +14,9 @@ from r3dpa.nn.layers import CircularConv2d, Float32CircularConv2d, Size, zeroed
 from r3dpa.nn.pixel_outputs import RangeMixture
 
 _NEIGHBOURS = (1, -1, 2, -2, 4, -4)  # columns
-NUM_DIFFERENCES = len(_NEIGHBOURS) + 3  # to neighbours, above, below, between the modes
 _NUM_REFINED = RangeMixture.num_outputs + 1  # and the logit of a return
-_NUM_KNOWN = NUM_DIFFERENCES + _NUM_REFINED - 2  # and the outputs that are no range
+# Differences to neighbours, above, below, between the modes; and the outputs that are no range.
+_NUM_KNOWN = len(_NEIGHBOURS) + 3 + _NUM_REFINED - 2
 _DILATIONS = (1, 2, 4)  # columns between the taps of a kernel, block by block
 # Encoded ranges are compared up to 1 / 32, about 6 % of the range in log2; other outputs are
 # divided by 5. Both then lie near [-1, 1].
@@ -50,7 +50,7 @@ class Refinement(nn.Module):
         self.stem, self.least_scale = (stem[0], stem[1]), least_scale
         self.features = nn.Conv2d(width, channels * stem[0] * stem[1], 1)
         self.conv_in = CircularConv2d(channels + _NUM_KNOWN, channels, (3, 3))
-        self.blocks = nn.ModuleList(DilatedBlock(channels, dilation) for dilation in _DILATIONS)
+        self.blocks = nn.ModuleList(_Block(channels, dilation) for dilation in _DILATIONS)
         self.conv_out = zeroed(Float32CircularConv2d(channels, _NUM_REFINED, (3, 3)))
         sizes = torch.tensor(_CORRECTION).view(-1, 1, 1)
         self.register_buffer("sizes", sizes, persistent=False)
@@ -79,25 +79,16 @@ class Refinement(nn.Module):
         Differences, since bfloat16 would round the ranges themselves by more than they ripple.
         """
         likelier = RangeMixture(outputs, self.least_scale).mode()
-        differences = _RANGE_FACTOR * neighbour_differences(outputs, likelier)
-        return torch.cat([differences.clamp(-1, 1), _OUTPUT_FACTOR * outputs[:, 2:]], dim=1)
+        beside = [likelier.roll(columns, -1) - likelier for columns in _NEIGHBOURS]
+        padded = F.pad(likelier, (0, 0, 1, 1), mode="replicate")
+        above, below = padded[:, :, :-2] - likelier, padded[:, :, 2:] - likelier
+        modes = outputs[:, 1:2] - outputs[:, :1]
+        differences = torch.cat([*beside, above, below, modes], dim=1)
+        differences = (_RANGE_FACTOR * differences).clamp(-1, 1)
+        return torch.cat([differences, _OUTPUT_FACTOR * outputs[:, 2:]], dim=1)
 
 
-def neighbour_differences(outputs: Tensor, likelier: Tensor) -> Tensor:
-    """Differences ``(B, 9, H, W)`` of encoded ranges to neighbours, and between the two modes.
-
-    Args:
-        outputs: ``(B, 2 or more, H, W)`` of a decoder, see :class:`RangeMixture`.
-        likelier: ``(B, 1, H, W)`` its likelier ranges.
-    """
-    beside = [likelier.roll(columns, -1) - likelier for columns in _NEIGHBOURS]
-    padded = F.pad(likelier, (0, 0, 1, 1), mode="replicate")
-    above, below = padded[:, :, :-2] - likelier, padded[:, :, 2:] - likelier
-    modes = outputs[:, 1:2] - outputs[:, :1]
-    return torch.cat([*beside, above, below, modes], dim=1)
-
-
-class DilatedBlock(nn.Module):
+class _Block(nn.Module):
     """Two convolutions, each after a swish, around a shortcut."""
 
     def __init__(self, channels: int, dilation: int) -> None:
@@ -106,5 +97,4 @@ class DilatedBlock(nn.Module):
         self.conv2 = zeroed(CircularConv2d(channels, channels, (3, 3)))
 
     def forward(self, hidden: Tensor) -> Tensor:
-        """Hidden values ``(B, C, H, W)`` and what the convolutions add to them."""
         return hidden + self.conv2(F.silu(self.conv1(F.silu(hidden))))

@@ -16,9 +16,6 @@ from r3dpa.nn.encoder_decoder import LOGIT_GAIN, Decoder, Encoder
 from r3dpa.nn.layers import Float32CircularConv2d, Size, at_least_float32
 from r3dpa.nn.pixel_outputs import PixelOutputs, RangeMixture, clean_image
 from r3dpa.nn.refinement import Refinement
-from r3dpa.nn.texture import Texture
-
-_BLOCK_WIDTH = 4  # of the layers of a texture on blocks of pixels, relative to its channels
 
 
 class _StraightThroughClamp(torch.autograd.Function):
@@ -155,8 +152,7 @@ class VAE(Autoencoder):
     of a VAE without these channels give the same latents. Without
     ``encode_further`` there is none, and the latents, which tell of range and return alone, are
     decoded to intensity and class as well. A ``refinement`` corrects ranges and returns pixel by
-    pixel, see :class:`r3dpa.nn.refinement.Refinement`; leaves in training alone. With a
-    ``texture``, images may be drawn with noise, see :class:`r3dpa.nn.texture.Texture`.
+    pixel, see :class:`r3dpa.nn.refinement.Refinement`; leaves in training alone.
 
     Source: Ran et al., "Towards realistic scene generation with LiDAR diffusion models" (CVPR
     2024); R3DPA (ICRA 2026) uses h2p4d8. State-dict keys follow the official checkpoints.
@@ -180,7 +176,6 @@ class VAE(Autoencoder):
             they have none.
         encode_further: The encoder sees intensity and class, not the decoder alone.
         refinement: Channels of the refinement, or 0 for none; needs two modes and classes.
-        texture: Channels of the texture, or 0 for none; needs two modes, intensity and classes.
 
     Example:
         >>> vae = VAE(channels=32, num_res_blocks=1)
@@ -206,7 +201,6 @@ class VAE(Autoencoder):
         num_classes: int = 0,
         encode_further: bool = True,
         refinement: int = 0,
-        texture: int = 0,
     ) -> None:
         if least_scale <= 0:
             raise ValueError(f"least_scale must be above 0, got {least_scale}")
@@ -221,11 +215,6 @@ class VAE(Autoencoder):
             raise ValueError(
                 f"refinement needs modes 2 and num_classes {NUM_CLASSES}, got {modes} and "
                 f"{num_classes}"
-            )
-        if texture and not (modes == 2 and intensity and num_classes == NUM_CLASSES):
-            raise ValueError(
-                f"texture needs modes 2, intensity true and num_classes {NUM_CLASSES}, got "
-                f"{modes}, {intensity} and {num_classes}"
             )
         num_levels = len(channel_multipliers)
         if len(strides) != num_levels - 1:
@@ -253,8 +242,6 @@ class VAE(Autoencoder):
         )
         if refinement:
             decoder.further_refinement = Refinement(widths[0], refinement, stem, least_scale)
-        if texture:
-            decoder.further_texture = Texture(texture, _BLOCK_WIDTH * texture)
         super().__init__(
             encoder,
             decoder,
@@ -264,7 +251,7 @@ class VAE(Autoencoder):
         )
         self.modes, self.least_scale = modes, least_scale
         self.intensity, self.num_classes = intensity, num_classes
-        self.encode_further, self.refinement, self.texture = encode_further, refinement, texture
+        self.encode_further, self.refinement = encode_further, refinement
 
     @property
     def image_channels(self) -> int:
@@ -309,34 +296,6 @@ class VAE(Autoencoder):
         if outputs.classes is not None:
             further.append(outputs.classes.argmax(dim=1, keepdim=True).to(prediction.dtype))
         return torch.cat([image, *further], dim=1) if further else image
-
-    def draw(self, latents: Tensor, noise: Tensor | None) -> Tensor:
-        """Images of raw latents: drawn with noise ``(B, n)``, or without, as of :meth:`decode`."""
-        if noise is None:
-            return self.decode(latents)
-        return self.draw_image(self.predict(latents), noise)
-
-    def draw_image(self, prediction: Tensor, noise: Tensor) -> Tensor:
-        """Images as of :meth:`image_of`, drawn by the texture.
-
-        Args:
-            prediction: ``(B, 22, H, W)`` outputs of the decoder.
-            noise: ``(B, n)`` standard normal, with n as :meth:`noise_size` says.
-        """
-        image = self.image_of(prediction)
-        drawn = self._texture(prediction, image[:, :1], noise)
-        return torch.cat([drawn, image[:, -1:]], dim=1)
-
-    def noise_size(self, image_size: Size) -> int:
-        """Values that an image of ``(H, W)`` pixels is drawn with."""
-        return self._texture.noise_size(image_size)
-
-    @property
-    def _texture(self) -> Texture:
-        texture = self.decoder.further_texture
-        if texture is None:
-            raise ValueError("this VAE has no texture: images cannot be drawn")
-        return cast(Texture, texture)
 
     def scan_of(self, prediction: Tensor) -> Tensor:
         """Images ``(B, in_channels, H, W)`` of outputs, as a discriminator sees scans.
