@@ -39,7 +39,8 @@ class SceneGenerator:
     """Draws scenes from a velocity network and decodes them.
 
     The random numbers of a scene are a function of (seed, index) alone and are drawn on the CPU:
-    up to rounding, a scene depends on neither batch size nor device. The modulations of a solver's
+    up to rounding, a scene depends on neither batch size nor device; a few pixels at outlines may
+    be decoded to the other side of their edge. The modulations of a solver's
     times are computed once, so weights must not change after the first scene.
 
     Args:
