@@ -206,10 +206,10 @@ class PointCloud:
         away = (points != before).any(axis=1)
         for axis, values in zip("xyz", points.T, strict=True):
             rows[self.names[axis]][away] = values[away]
-        for name in (n for n in self.columns if n.lower() in _RANGES):
-            unit = self._range_unit(name)
-            range_m = np.linalg.norm(points[away].astype(float), axis=1)
+        for name in self.columns:
+            unit = self._range_unit(name) if name.lower() in _RANGES else None
             if unit is not None:
+                range_m = np.linalg.norm(points[away].astype(float), axis=1)
                 is_whole = rows.dtype[name].kind in "iu"
                 rows[name][away] = np.rint(unit * range_m) if is_whole else unit * range_m
         if intensity is not None:
@@ -397,7 +397,9 @@ def _npy_of(cloud: PointCloud, full_scale: float | None) -> bytes:
 
 def _npz_of(cloud: PointCloud, full_scale: float | None) -> bytes:
     stream, columns = io.BytesIO(), _all_columns(cloud, full_scale)
-    others: dict[str, Any] = {name: columns[name] for name in columns if name not in {*"xyz"}}
+    others: dict[str, Any] = {
+        name: column for name, column in columns.items() if name not in ("x", "y", "z")
+    }
     for name in ("file", "xyz"):
         if name in others:
             raise ScanError(f"column {name!r} cannot be written to .npz: rename it")
@@ -462,7 +464,9 @@ def known_columns(where: str | Path, table: Table) -> dict[str, str]:
         if name is None and key in "xyz":
             raise ScanError(f"{where}: has no column {key}, only {', '.join(names.values())}")
         if name is not None:
-            known[key], kind = name, table.dtype[name]
-            if kind.kind not in ("f" if key in "xyz" else "fiu"):
+            known[key] = name
+            kind = table.dtype[name]
+            allowed = "f" if key in "xyz" else "fiu"
+            if kind.kind not in allowed:
                 raise ScanError(f"{where}: column {name} is of {kind}; {key} must be one float")
     return known

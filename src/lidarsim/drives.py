@@ -215,8 +215,12 @@ def split_scans(scans: int, drives: Sequence[str]) -> dict[str, int]:
         )
     train = [drive for drive in TRAIN_DRIVES if drive in drives]
     val = [drive for drive in VAL_DRIVES if drive in drives]
-    num_val = max(1, round(VAL_SHARE * scans)) if scans > 1 else 0
-    num_val = num_val if train and val else scans * (not train)
+    if not train:
+        num_val = scans
+    elif not val or scans == 1:
+        num_val = 0
+    else:
+        num_val = max(1, round(VAL_SHARE * scans))
     return _share(scans - num_val, train) | _share(num_val, val)
 
 
@@ -236,6 +240,7 @@ def expected_scans(root: Path) -> dict[str, int] | None:
 
 
 def _share(scans: int, drives: list[str]) -> dict[str, int]:
+    """Deal scans out to drives in turn; a drive that gets none is left out."""
     counts = (len(range(place, scans, len(drives))) for place in range(len(drives)))
     return {drive: count for drive, count in zip(drives, counts, strict=True) if count}
 
@@ -251,22 +256,22 @@ def _check_folder(out: Path, request: dict[str, Any]) -> bool:
                 f"{out} holds a data set that was not simulated ({_MANIFEST} is missing); "
                 f"give another folder"
             )
-        if scans := [file for file in sorted(out.glob("*")) if suffix_of(file) in READERS]:
+        if others := [file for file in sorted(out.glob("*")) if suffix_of(file) in READERS]:
             raise ValueError(
-                f"{out} holds scans that were not simulated, such as {scans[0].name}, which "
+                f"{out} holds scans that were not simulated, such as {others[0].name}, which "
                 "readers would no longer find: give another folder"
             )
         return False
     stored = read_json(manifest, _START_AGAIN)
-    num_stored = stored.get("scans")
-    scans = request["scans"]
-    same_scans = stored | ({"scans": scans} if isinstance(num_stored, int) else {})
-    if different := list(differences(same_scans, request)):
+    num_stored, num_wanted = stored.get("scans"), request["scans"]
+    if isinstance(num_stored, int):  # another number of scans is no other request
+        stored = stored | {"scans": num_wanted}
+    if different := list(differences(stored, request)):
         raise ValueError(
             f"{out} holds a data set of another request ({'; '.join(different)}); give another "
             f"folder, or delete it"
         )
-    return isinstance(num_stored, int) and num_stored > scans
+    return isinstance(num_stored, int) and num_stored > num_wanted
 
 
 def _run(task: _Task) -> int:

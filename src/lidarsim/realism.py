@@ -298,16 +298,17 @@ def realism_table(
         raise ValueError("realism needs at least one drive of scans and one of the reference")
     a = sum(scans.values(), ScanStatistics())
     b = sum(reference.values(), ScanStatistics())
-    of_scans, of_reference = ([*map(measures, drives.values())] for drives in (scans, reference))
-    pairs, real_pairs = [*product(of_scans, of_reference)], [*combinations(of_reference, 2)]
+    of_scans = [measures(drive) for drive in scans.values()]
+    of_reference = [measures(drive) for drive in reference.values()]
+    pairs = list(product(of_scans, of_reference))
+    real_pairs = list(combinations(of_reference, 2))
     whole_b = measures(b)
     rows = []
     for name, measure in measures(a).items():
-        distances, floors = (
-            np.array([float(measure.distance(x[name].values, y[name].values)) for x, y in both])
-            for both in (pairs, real_pairs)
-        )
-        distance, floor = _over_finite(np.median, distances), _over_finite(np.median, floors)
+        distances = _distances_of_pairs(measure, pairs)
+        floors = _distances_of_pairs(measure, real_pairs)
+        distance = _over_finite(np.median, distances)
+        floor = _over_finite(np.median, floors)
         real = whole_b[name]
         ratio = math.nan
         lacks = {"A": measure.lacks, "B": real.lacks}
@@ -332,6 +333,14 @@ def realism_table(
         )
     described = (_describe_drives("A", scans, a), _describe_drives("B", reference, b))
     return RealismTable(tuple(rows), (*described, *notes))
+
+
+def _distances_of_pairs(
+    measure: Measure, pairs: Iterable[tuple[Mapping[str, Measure], Mapping[str, Measure]]]
+) -> Floats:
+    """Distances of one measure between the two drives of each pair."""
+    name = measure.name
+    return np.array([float(measure.distance(x[name].values, y[name].values)) for x, y in pairs])
 
 
 def _cells(row: RealismRow) -> tuple[str, ...]:

@@ -189,11 +189,19 @@ def scale_of(intensity: NDArray | None, full: float | None = None) -> IntensityS
     else:
         scale, unit = largest, "instrument units"
     scale = full or scale
-    off_grid = {s: np.abs(values / s - np.round(values / s)).max() for s in (scale / 100, 1.0)}
-    step = next((s for s, most in off_grid.items() if scale > s and most < 1e-3), 0.0)
+    step = 0.0
+    for candidate in (1.0, scale / 100):  # the last that fits counts
+        if candidate < scale and _are_multiples(values, candidate):
+            step = candidate
     steps = f" in steps of {step:g}" if step else ""
     text = f"intensity {low:g}..{high:g}{steps}: {unit}, full scale {scale:g}"
     return IntensityScale(scale, step, True, text)
+
+
+def _are_multiples(values: NDArray, step: float) -> bool:
+    """Whether values are multiples of a step, to a thousandth of it."""
+    off_grid = np.abs(values / step - np.round(values / step))
+    return bool(off_grid.max() < 1e-3)
 
 
 def _shares(scan: RecordedScan, scale: IntensityScale) -> Floats:
@@ -336,5 +344,6 @@ class RecordedSweep(Sweep):
 def _in_the_middle(box: Primitive, direction: Floats, time_s: NDArray) -> Primitive:
     """A vehicle that is where rays show it, moved to its place in the middle of the turn."""
     time = float(time_s[(np.array(box.centre) @ direction).argmax()])
-    x, y = (c - v * time for c, v in zip(box.centre, box.velocity_m_s, strict=False))
-    return replace(box, centre=(x, y, box.centre[2]))
+    x, y, z = box.centre
+    speed_x, speed_y = box.velocity_m_s
+    return replace(box, centre=(x - speed_x * time, y - speed_y * time, z))

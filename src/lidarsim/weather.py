@@ -52,7 +52,7 @@ REFUSED = {
 _ON_REQUEST = ("blooming", "range_noise")
 # Detection is re-evaluated where the power of an echo has changed.
 _DETECTION = {"soft_raydrop", "detection_limit", "dual_return"}
-# Of labels with an instance: KITTI-360, SemanticKITTI.
+# Classes of vehicles: of KITTI-360, then of SemanticKITTI, whose ids from 252 on are in motion.
 _VEHICLES = (Semantic.CAR, Semantic.TRUCK, Semantic.BUS, 10, 18, 252, 257, 258, 259)
 # A vehicle of fewer points has no box.
 _LEAST_POINTS = 20
@@ -215,8 +215,10 @@ def _seconds(cloud: PointCloud) -> NDArray[np.float64] | None:
     if cloud.time_s is None or not len(cloud):
         return cloud.time_s
     elapsed = (cloud.time_s - cloud.time_s.min()).astype(float)
-    units = (1.0, 1e-3, 1e-6, 1e-9)
-    return elapsed * next((u for u in units if elapsed.max() * u <= _LONGEST_TURN_S), units[-1])
+    for unit_s in (1.0, 1e-3, 1e-6):
+        if elapsed.max() * unit_s <= _LONGEST_TURN_S:
+            return elapsed * unit_s
+    return elapsed * 1e-9
 
 
 def changed_cloud(cloud: PointCloud, result: WeatheredScan) -> PointCloud:
@@ -252,10 +254,13 @@ def _switched(
     for name in REFUSED.keys() & on:
         raise ValueError(f"effect {name} cannot act on a recorded scan: {REFUSED[name]}")
     left_out = {*REFUSED, *_ON_REQUEST} - on
-    wanted = {name: e for e in EFFECTS if (name := effect_name(e)) not in left_out}
-    why = "nothing calls for it"
-    idle = (EffectRecord(n, "off" if n in off else "not_called", why, 0) for n in wanted)
-    return off, list(wanted.values()), tuple(idle)
+    by_name = {effect_name(effect): effect for effect in EFFECTS}
+    wanted = {name: effect for name, effect in by_name.items() if name not in left_out}
+    idle = tuple(
+        EffectRecord(name, "off" if name in off else "not_called", "nothing calls for it", 0)
+        for name in wanted
+    )
+    return off, list(wanted.values()), idle
 
 
 def kept_part(
@@ -286,37 +291,45 @@ def _result(
     intensity = None if scan.intensity is None else scan.intensity.copy()
     stays = np.ones(len(scan), dtype=bool)
     stays[sweep.rays_of] = False
-    added, moved, dimmed = [], 0, 0
+    added = []
+    num_moved = num_dimmed = 0
     for echo, is_seen in zip(echoes, seen, strict=True):
-        rays = np.flatnonzero(is_seen & (echo.origin == Origin.SURFACE))
-        stays[sweep.rays_of[rays]] = True
-        away = rays[echo.range_m[rays] != sweep.recorded_m[rays]]
+        is_surface = echo.origin == Origin.SURFACE
+        surface_rays = np.flatnonzero(is_seen & is_surface)
+        stays[sweep.rays_of[surface_rays]] = True
+        away = surface_rays[echo.range_m[surface_rays] != sweep.recorded_m[surface_rays]]
         points[sweep.rays_of[away]] = sweep.at(away, echo.range_m[away])
-        weaker = rays[echo.power[rays] != sweep.recorded_power[rays]]
-        moved, dimmed = moved + len(away), dimmed + len(weaker)
+        weaker = surface_rays[echo.power[surface_rays] != sweep.recorded_power[surface_rays]]
+        num_moved += len(away)
+        num_dimmed += len(weaker)
         if intensity is not None:
             faded = sweep.in_units(echo.power[weaker], echo.range_m[weaker])
             at = sweep.rays_of[weaker]
             intensity[at] = np.minimum(intensity[at], faded.astype(intensity.dtype))
-        rays = np.flatnonzero(is_seen & (echo.origin != Origin.SURFACE))
-        range_m, origin = echo.range_m[rays], echo.origin[rays]
-        shown = sweep.in_units(echo.power[rays], range_m)
-        added.append((sweep.at(rays, range_m), shown, sweep.rays_of[rays], origin))
+        air_rays = np.flatnonzero(is_seen & ~is_surface)
+        range_m, origin = echo.range_m[air_rays], echo.origin[air_rays]
+        shown = sweep.in_units(echo.power[air_rays], range_m)
+        added.append((sweep.at(air_rays, range_m), shown, sweep.rays_of[air_rays], origin))
 
-    new, shown, shot, made_by = map(np.concatenate, zip(*added, strict=True))
+    new, shown, shot, made_by = (np.concatenate(parts) for parts in zip(*added, strict=True))
     kept = np.flatnonzero(stays)
     labels = scan.labels
     if labels is not None:
         labels = np.concatenate([labels[kept], ADDED_CLASS + made_by.astype(np.uint32)])
     if intensity is not None:
         intensity = np.concatenate([intensity[kept], shown.astype(intensity.dtype)])
-    outshone = np.where(seen[0], echoes[0].origin, Origin.SURFACE)[~stays[sweep.rays_of]]
-    counts = _by_origin(outshone)
+    # What the shots of lost points report in their place; the surface if nothing.
+    in_place = np.where(seen[0], echoes[0].origin, Origin.SURFACE)[~stays[sweep.rays_of]]
+    counts = _by_origin(in_place)
     lost = {"too weak": counts.pop("surface", 0)} | counts
     report = {
-        "points": len(scan), "intensity": sweep.scale.text, "lost": lost, "moved": moved,
-        "dimmed": dimmed, "added": _by_origin(made_by),
-    }  # fmt: skip
+        "points": len(scan),
+        "intensity": sweep.scale.text,
+        "lost": lost,
+        "moved": num_moved,
+        "dimmed": num_dimmed,
+        "added": _by_origin(made_by),
+    }
     return WeatheredScan(
         points=np.concatenate([points[kept], new]),
         intensity=intensity,

@@ -92,6 +92,7 @@ def test_a_sector_and_the_rest_of_the_turn_share_no_pixel_and_leave_none():
         (lambda: sector(COARSE, 10, 10), "give -180 and 180"),
         (lambda: sector(COARSE, -200, 200), "at most 360 apart"),
         (lambda: sector(COARSE, math.nan, 20), r"-360\.\.360"),
+        (lambda: sector(COARSE, 20, math.nan), r"-360\.\.360"),
         (lambda: box3d(COARSE, (100, 0, 0), (4, 2, 2)), r"no ray meets it.* 1 to 56 m"),
         (lambda: box3d(COARSE, (0, 0.5, 0.5), (0.1, 0.1, 0.1)), r"no ray meets it.* 1 to 56 m"),
         (lambda: box3d(COARSE, (10, 0, 9.5), (4, 2, 1)), r"no ray meets it.* -15\.0 to 15\.0"),

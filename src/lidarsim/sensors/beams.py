@@ -43,9 +43,8 @@ class BeamFit(NamedTuple):
     inclination: Floats  # (H,)
     height_m: Floats  # (H,)
     is_sure_height: Mask  # (H,)
-    residual: (
-        Floats  # (P,) inclination of each point seen from the centre of its beam, minus its own
-    )
+    #: (P,) inclination of each point seen from the centre of its beam, minus the beam's.
+    residual: Floats
 
 
 class ColumnFit(NamedTuple):
@@ -129,26 +128,26 @@ def fit_columns(beam: Indices, azimuth: Floats, distance_m: Floats, scan: Indice
     Raises:
         ValueError: If no beam has neighbours in azimuth.
     """
-    turned, azimuth, inverse = azimuth, azimuth % (2 * math.pi), 1 / distance_m
-    order = np.lexsort((azimuth, beam, scan))
+    wrapped, inverse = azimuth % (2 * math.pi), 1 / distance_m
+    order = np.lexsort((wrapped, beam, scan))
     before, after = order[:-1], order[1:]
     is_beside = (beam[before] == beam[after]) & (scan[before] == scan[after])
     before, after = before[is_beside], after[is_beside]
-    step = azimuth[after] - azimuth[before]
+    step = wrapped[after] - wrapped[before]
     change = inverse[after] - inverse[before]
     is_level = np.abs(change) < _SAME_SURFACE * inverse[after]
     ahead = step[is_level & (step > 1e-5)]
     if len(ahead) == 0:
         raise ValueError("no beam has neighbouring points, so its columns are unknown")
     usual = float(np.median(ahead))
-    turns = _turns(beam, turned, scan)
+    turns = _turns(beam, azimuth, scan)
     column_rad = usual  # where shots of a second turn lie between the first ones
     if turns < MORE_THAN_A_TURN:
         column_rad = float(ahead[ahead < _UNBROKEN * usual].mean())
 
     num_beams = int(beam.max()) + 1
     lateral_m = _lateral(beam[before], step, change, column_rad, num_beams)
-    straight = azimuth - lateral_m[beam] * inverse
+    straight = wrapped - lateral_m[beam] * inverse
     columns, coherence = _most_coherent(scan * num_beams + beam, straight, 2 * math.pi / column_rad)
     column_rad = 2 * math.pi / columns
     offset, agreement = _phase(beam, straight, columns, num_beams)

@@ -134,8 +134,11 @@ class SensorEstimate:
                 f"{self.mount.height_m:.2f} m above the ground, which rises by "
                 f"{self.mount.pitch_deg:.1f} degrees ahead, {self.mount.roll_deg:.1f} to the left"
             )
-        known = self.confidence
-        return [[k, v, f"{known[k]:.0%}" if k in known else ""] for k, v in values.items()]
+        rows = []
+        for quantity, value in values.items():
+            share = self.confidence.get(quantity)
+            rows.append([quantity, value, "" if share is None else f"{share:.0%}"])
+        return rows
 
 
 def estimate_sensor(scans: Sequence[Any] | str | Path) -> SensorEstimate:
@@ -317,21 +320,21 @@ def _rotation(
 ) -> tuple[str | None, Floats | None]:
     """Direction of rotation, and azimuth of the head at each point of organised arrays."""
     head = None
+    first = read[0].cloud
     if points.column is not None:
         order = np.lexsort((points.column, points.beam, points.scan))
         sign = _sign(azimuth[order], points.beam[order])
         head = sign * 2 * math.pi * points.column / int(read[0].num_columns or 1)
-    elif read[0].cloud.time_s is not None and np.ptp(read[0].cloud.time_s) > 0:
-        xyz = read[0].cloud.points.astype(float)
-        order = np.argsort(read[0].cloud.time_s, kind="stable")
-        beams = np.zeros(len(order)) if read[0].cloud.ring is None else read[0].cloud.ring[order]
-        by_beam = np.argsort(beams, kind="stable")
-        turned = np.arctan2(xyz[:, 1], xyz[:, 0])[order][by_beam]
-        sign = _sign(turned, beams[by_beam])
-    elif read[0].cloud.ring is not None and (np.diff(read[0].cloud.ring) != 0).mean() > 0.5:
+    elif first.time_s is not None and np.ptp(first.time_s) > 0:
+        beams = np.zeros(len(first)) if first.ring is None else first.ring
+        by_time = np.argsort(first.time_s, kind="stable")
+        order = by_time[np.argsort(beams[by_time], kind="stable")]
+        xyz = first.points.astype(float)
+        sign = _sign(np.arctan2(xyz[:, 1], xyz[:, 0])[order], beams[order])
+    elif first.ring is not None and (np.diff(first.ring) != 0).mean() > 0.5:
         # Firing after firing, in the order of time.
-        first = np.flatnonzero(points.scan == points.scan[0])
-        order = first[np.argsort(points.beam[first], kind="stable")]
+        rows = np.flatnonzero(points.scan == points.scan[0])
+        order = rows[np.argsort(points.beam[rows], kind="stable")]
         sign = _sign(azimuth[order], points.beam[order])
     else:
         return None, None

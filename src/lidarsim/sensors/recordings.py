@@ -74,10 +74,9 @@ def read_scan_of(scan: Any, number: int) -> SensorScan:
     check_metres(name, cloud.points)
     cloud = cloud.without_origin()
     _check_upright(name, cloud.points)
-    usable = column is not None and shape is not None and len(column) == len(cloud)
-    return SensorScan(
-        name, cloud, column if usable else None, shape[1] if shape and usable else None
-    )
+    if column is None or shape is None or len(column) != len(cloud):
+        return SensorScan(name, cloud, None, None)
+    return SensorScan(name, cloud, column, shape[1])
 
 
 def _check_upright(name: str, points: NDArray) -> None:

@@ -72,14 +72,15 @@ class RunCheckpoint(ModelCheckpoint):
         self._step = trainer.global_step
         self._signal = signal.SIGTERM if trainer.received_sigterm else 0
         if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGTERM, signal.SIGINT):  # Lightning restores those before
 
-                def stop(received: int, _: object) -> None:
-                    if self._signal == received == signal.SIGINT and trainer.world_size == 1:
-                        raise KeyboardInterrupt  # of several, torchrun sends each another one
-                    self._signal = received
+            def stop(received: int, _: object) -> None:
+                is_second = self._signal == received == signal.SIGINT
+                if is_second and trainer.world_size == 1:
+                    raise KeyboardInterrupt  # torchrun sends several processes two signals each
+                self._signal = received
 
-                signal.signal(number, stop)
+            for number in (signal.SIGTERM, signal.SIGINT):
+                signal.signal(number, stop)  # Lightning restores the handlers before
 
     def on_after_backward(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Send the stop signal with the guard's all-reduce."""
@@ -153,9 +154,8 @@ class RunCheckpoint(ModelCheckpoint):
         """
         super().on_fit_end(trainer, pl_module)
         resumed = Path(trainer.ckpt_path or "")
-        if resumed.name != f"{self.CHECKPOINT_NAME_LAST}.ckpt" and not (
-            self._should_skip_saving_checkpoint(trainer)
-        ):
+        is_last = resumed.name == f"{self.CHECKPOINT_NAME_LAST}.ckpt"
+        if not is_last and not self._should_skip_saving_checkpoint(trainer):
             self._save_last_checkpoint(trainer, self._monitor_candidates(trainer))
 
 

@@ -101,8 +101,10 @@ class StepGuard(L.Callback):
         moved = [b for b, _ in self._buffers if b.numel() and b.is_floating_point()]
         sizes = torch._foreach_norm(moved, torch.inf) if moved else ()
         bad_buffers = ~torch.stack([norms.new_zeros(()), *sizes]).isfinite().all()
-        shared = torch.stack([bad_losses, ~norms.isfinite().all(), bad_buffers, bad_buffers]).int()
-        shared[3] = self.stop
+        bad_gradients = ~norms.isfinite().all()
+        stop = torch.full_like(bad_losses, int(self.stop), dtype=torch.int32)
+        flags = [bad_losses.int(), bad_gradients.int(), bad_buffers.int()]
+        shared = torch.stack([*flags, stop])
         if dist.is_available() and dist.is_initialized() and dist.get_world_size() > 1:
             dist.all_reduce(shared, dist.ReduceOp.MAX)  # one process skips: all skip
         # Read at once, as each read makes the host wait for the device.

@@ -79,13 +79,13 @@ def sampling(
     """
     check_folder(out)
     options = {
-        "scenes": scenes,
-        "batch_size": batch_size,
-        "rounds": rounds,
-        "nfe": nfe,
-        "reference_steps": reference_steps,
+        "--num": scenes,
+        "--batch_size": batch_size,
+        "--rounds": rounds,
+        "--nfe": nfe,
+        "--reference_steps": reference_steps,
     }
-    given = ["--num" if n == "scenes" else f"--{n}" for n, v in options.items() if v is not None]
+    given = [option for option, value in options.items() if value is not None]
     if given and ckpt is None:
         raise ValueError(f"{', '.join(given)}: for a model, give --ckpt, such as r3dpa-s")
     from r3dpa.bench.sampling import sampling as measure

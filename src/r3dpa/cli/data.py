@@ -56,11 +56,13 @@ def check(folder: Path, *, columns: tuple[str, ...] = ()) -> None:
             cloud = read_cloud(file, columns)
             cloud.check_metres()
             lines.append(describe_scan(cloud))
-        except ScanError as error:  # of a .bin file, which check_scans names
+        except ScanError as error:
             num_bad += 1
-            lines += [f"bad: {error}"] if others else []
+            if others:  # a bad .bin file is named by check_scans
+                lines.append(f"bad: {error}")
     if others:
-        text, usable = f"{folder.absolute()}: {verdict(len(others), num_bad)}", not num_bad
+        text = f"{folder.absolute()}: {verdict(len(others), num_bad)}"
+        usable = num_bad == 0
     else:
         text, usable = check_scans(folder)
     is_plain = not is_layout and bool(others or kitti)

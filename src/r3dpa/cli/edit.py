@@ -129,8 +129,10 @@ def inpaint(
         grid_size = session.sit.grid_size
         return most_like_first(edits, region, feature, extractor, grid_size, inside, semantic_class)
 
-    scans, names = {f"scan {scan.stem}": source}, ("kept", object or "generated anew")
-    return session.write("inpaint", arguments, scans, run, region, names, feature is not None)
+    scans = {f"scan {scan.stem}": source}
+    parts = ("kept", object or "generated anew")
+    is_guided = feature is not None
+    return session.write("inpaint", arguments, scans, run, region, parts, guided=is_guided)
 
 
 def mix(

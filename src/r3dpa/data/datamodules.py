@@ -266,7 +266,8 @@ class LidarDataModule(LoaderModule):
         Before training, the share of the points that the images hold is printed.
         """
         train, val, self.projection = self._scans_and_projection()
-        scans, grids = sorted({*train, *val}), None  # a scan may be repeated in training
+        scans = sorted({*train, *val})  # a scan may be repeated in training
+        grids: FeatureGrids | None = None
         if stage == "fit" and scans and not self.makes_scans:
             # Held-out scans are none of further_scans.
             checked = evenly(val or train, _SCANS_TO_CHECK)

@@ -123,8 +123,10 @@ def find_labels(scan: str | Path, num_points: int) -> NDArray[np.int64] | None:
 
 def labels_of_cloud(cloud: PointCloud) -> NDArray[np.int64] | None:
     """Labels ``(P,)`` as of :func:`read_labels` of a scan that was read; None without labels."""
-    if cloud.labels is None or cloud.file is None:
-        return None if cloud.labels is None else cloud.labels.astype(np.int64)
+    if cloud.labels is None:
+        return None
+    if cloud.file is None:
+        return cloud.labels.astype(np.int64)
     return _kitti_360(cloud.labels, cloud.file.path)
 
 

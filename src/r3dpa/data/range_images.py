@@ -121,15 +121,15 @@ class SimulatedImageDataModule(SimulatedDataModule):
         counts = split_scans(self.num_scans, (*TRAIN_DRIVES, *VAL_DRIVES))
         store = self._store
         request = crc32(store.settings.encode())
-        train, val = (
-            [
+
+        def images_of(drives: Sequence[str]) -> list[Any]:
+            return [
                 SimulatedImage(drive, number * self.every, request, store.folder)
                 for drive in drives
                 for number in range(counts.get(drive, 0))
             ]
-            for drives in (TRAIN_DRIVES, VAL_DRIVES)
-        )
-        return train, val
+
+        return images_of(TRAIN_DRIVES), images_of(VAL_DRIVES)
 
     def simulate(self) -> None:
         """Simulate the images that are missing."""

@@ -226,14 +226,18 @@ def _tensors(file: Path) -> Arrays:
         parts = [content]
         if isinstance(content, dict) and {"depth", "xyz"} <= content.keys():
             parts = [content[key] for key in ("depth", "xyz", "reflectance") if key in content]
-        values = torch.cat([part.detach().float() for part in parts], dim=-3 if parts[1:] else 0)
+        axis = -3 if len(parts) > 1 else 0  # parts become channels
+        values = torch.cat([part.detach().float() for part in parts], dim=axis)
     except UNPICKLING_ERRORS as error:
         raise ScanError(
             f"{file}: cannot be read as tensors alone ({first_line(error)}); needs a tensor "
             "(C, H, W) or (N, C, H, W), or a dictionary of depth, xyz and reflectance"
         ) from error
     array = values.numpy()
-    yield from [("", array)] if array.ndim == 3 else _parts(str(file), array)
+    if array.ndim == 3:
+        yield "", array
+    else:
+        yield from _parts(str(file), array)
 
 
 _READERS: dict[str, Callable[[Path], Arrays]] = {

@@ -73,14 +73,21 @@ class Scan:
 def find_scans(
     source: str | Path | Sequence[str | Path], columns: Sequence[str] = ()
 ) -> list[Scan]:
-    """All scans of a folder (with its sub-folders), file, glob, or list of these, sorted.
+    """Return all scans of a folder (with its sub-folders), file, glob, or list of these, sorted.
 
-    In the KITTI-360 layout (a folder that holds ``data_3d_raw``), only the Velodyne scans. Of other
-    folders and globs, the ``.bin`` files, or else files of one other format that can be read. Links
-    to folders are followed; hidden files are left out. The drive of a scan is its folder relative
-    to the given folder, or to the common parent of a glob or list. ``columns`` names the columns of
-    files without names. ``ValueError`` if nothing is found, one file is named twice, or a name
-    could not be an output file's.
+    A folder in the KITTI-360 layout (one that holds ``data_3d_raw``) gives its Velodyne scans.
+    Other folders and globs give their ``.bin`` files; if there are none, the files of the only
+    other format that can be read. Links to folders are followed; hidden files are left out. The
+    drive of a scan is its folder relative to the given folder, or to the common parent of a glob or
+    list.
+
+    Args:
+        source: Folder, file, glob, or list of these.
+        columns: Names of the columns of files without names.
+
+    Raises:
+        ValueError: If nothing is found, several formats other than ``.bin`` are, a file is named
+            twice, or the name of a scan cannot be the name of an output file.
     """
     given = [source] if isinstance(source, str | Path) else list(source)
     entries = [_without_dots(Path(entry).absolute()) for entry in given]

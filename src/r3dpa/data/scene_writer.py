@@ -154,7 +154,10 @@ class SceneWriter:
             labels: ``(B, H, W)`` KITTI-360 class of the points.
         """
         self._wait()
-        intensity, labels = (x if x is None else x.cpu() for x in (intensity, labels))
+        if intensity is not None:
+            intensity = intensity.cpu()
+        if labels is not None:
+            labels = labels.cpu()
         self._batch = self._thread.submit(self._write, range_m.cpu(), nfe, intensity, labels)
 
     def close(self) -> None:
@@ -211,7 +214,8 @@ class SceneWriter:
     def _written_before(self) -> tuple[int, int]:
         try:
             first, *later = self._journal.read()
-            stored, last = first["request"], [first, *later][-1]
+            stored = first["request"]
+            last = later[-1] if later else first
             num_done, evaluations = int(last["num_done"]), int(last["evaluations"])
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(

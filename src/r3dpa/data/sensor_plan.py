@@ -22,13 +22,15 @@ from r3dpa.geometry import BeamProjection, describe_share_kept, share_kept
 from r3dpa.io import write_text
 
 MOST_SIMULATED, FEWEST_SIMULATED = 2000, 32
-# Measured on two idle cores, for ten minutes in all: shares of the time, and steps of the stages.
-_SIMULATION_SHARE, _VAE_STEPS, _FLOW_STEPS = 0.2, 160, 200
-_VAE_SHARE, _FLOW_SHARE = 0.35, 0.4  # after which a stage stops, on slow machines
+# Measured on two idle cores, for ten minutes in all.
+_SIMULATION_SHARE = 0.2  # of the time
+_VAE_STEPS, _FLOW_STEPS = 160, 200
+_VAE_SHARE, _FLOW_SHARE = 0.35, 0.4  # of the time, after which a slow machine ends a stage
 _LATENTS = (8, 64)  # rows and columns of r3dpa-s, which the stem makes of any image
 _STRIDE = 2  # of its VAE beyond the stem, in both directions
 _GRID = (8, 32)
-_FEWEST_HELD_OUT, _HELD_OUT_SHARE = 2, 5  # of which a comparison consists; every fifth scan
+_FEWEST_HELD_OUT = 2  # fewer cannot be compared
+_HOLD_OUT_EVERY = 5
 _USER_SHARE = 1 / 3  # of the training scans of an epoch
 _EVERY = 20  # simulated scans of a drive are 2 s apart
 _TIMED_SCANS = 3
@@ -222,8 +224,8 @@ class SensorPlan:
 def split_of(num_scans: int) -> Split:
     """Hold out every fifth scan, but at least two, and none of one or two scans."""
     if num_scans <= _FEWEST_HELD_OUT:
-        return Split(num_scans, 0, _HELD_OUT_SHARE)
-    num_held_out = max(_FEWEST_HELD_OUT, num_scans // _HELD_OUT_SHARE)
+        return Split(num_scans, 0, _HOLD_OUT_EVERY)
+    num_held_out = max(_FEWEST_HELD_OUT, num_scans // _HOLD_OUT_EVERY)
     val_every = math.ceil(num_scans / num_held_out)
     num_held_out = len(range(0, num_scans, val_every))
     return Split(num_scans - num_held_out, num_held_out, val_every)

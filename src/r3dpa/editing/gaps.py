@@ -194,14 +194,17 @@ def _neighbours(range_m: Tensor, missing: Tensor, how: Interpolation) -> _Neighb
     """
     vertical, has_known = _neighbours_along_rows(range_m.T, ~missing.T)
     has_known = has_known.T
-    vertical = _Neighbours(*(values.T for values in vertical))
+    vertical = _Neighbours(vertical.first.T, vertical.second.T, vertical.share.T)
     range_m = torch.where(missing & has_known, vertical.interpolate(how), range_m)
     width = range_m.shape[1]
     known = (~missing | has_known).repeat(1, 3)
     horizontal, _ = _neighbours_along_rows(range_m.repeat(1, 3), known)
     middle = slice(width, 2 * width)
-    pairs = zip(vertical, horizontal, strict=True)
-    return _Neighbours(*(torch.where(has_known, up, side[:, middle]) for up, side in pairs))
+    return _Neighbours(
+        torch.where(has_known, vertical.first, horizontal.first[:, middle]),
+        torch.where(has_known, vertical.second, horizontal.second[:, middle]),
+        torch.where(has_known, vertical.share, horizontal.share[:, middle]),
+    )
 
 
 def _neighbours_along_rows(values: Tensor, known: Tensor) -> tuple[_Neighbours, Tensor]:

@@ -263,9 +263,9 @@ def most_like_first(
     Likeness is the mean cosine between the feature of the object and the features of the part's
     cells, which the feature source takes from the points of the draw. The ``cosine`` of the edits
     cannot replace it: it is of features that the network predicts, which guidance may raise
-    without making an object. Where the object has a box, draws come first of whose points in the
-    box the feature source takes half for the object, and draws come last that put few points into
-    it, since their object stands in front of it or behind.
+    without making an object. Where the object has a box, draws come first if the feature source
+    takes at least half of their points in the box for the object; draws with few points in the box
+    come last, since their object stands in front of it or behind.
 
     Args:
         edits: Draws of :meth:`SceneEditor.inpaint`.
@@ -297,9 +297,11 @@ def most_like_first(
             if classes_of_points is not None:
                 of_class = classes_of_points(points) == semantic_class
                 counts_of_class.append((in_box & of_class).sum())
-    likeness = order = torch.stack(cosines)
+    likeness = torch.stack(cosines)
     edits = replace(edits, draws=torch.arange(len(edits)), likeness=likeness)
-    # Cosines differ by 2 at most.
+    # Groups of draws, ordered by likeness within: likeness differs by 2 at most, so that 2 more
+    # lift a draw that fills the box above the others, and 4 more one that is also recognised.
+    order = likeness
     if counts:
         points_inside = torch.stack(counts)
         edits = replace(edits, points_inside=points_inside)
@@ -308,7 +310,8 @@ def most_like_first(
         points_of_class = torch.stack(counts_of_class)
         edits = replace(edits, points_of_class=points_of_class)
         recognised = points_of_class >= _RECOGNISED * points_inside
-        order = order + 4 * (recognised & _fills(points_of_class * recognised))
+        points_recognised = torch.where(recognised, points_of_class, 0)
+        order = order + 4 * (recognised & _fills(points_recognised))
     return edits[order.argsort(descending=True, stable=True)]
 
 

@@ -302,7 +302,8 @@ def _covered(place: Tensor, width: float) -> Tensor:
 
 def _between(projection: Projection, from_deg: float, to_deg: float, what: str) -> Tensor:
     """Columns ``(W,)`` bool whose rays lie between two azimuths."""
-    if not max(abs(from_deg), abs(to_deg), to_deg - from_deg) <= _TURN_DEG:  # NaN too
+    are_turns = abs(from_deg) <= _TURN_DEG and abs(to_deg) <= _TURN_DEG  # NaN is not
+    if not are_turns or to_deg - from_deg > _TURN_DEG:
         raise ValueError(f"{what}: azimuths must lie in -360..360 degrees, at most 360 apart")
     if from_deg == to_deg:
         raise ValueError(f"{what} is empty: for a full turn give -180 and 180")

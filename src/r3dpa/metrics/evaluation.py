@@ -366,12 +366,11 @@ def _figure_data(
     places, samples = measured.metrics["matching"].subset("generated")
     _, scans = measured.metrics["matching"].subset("real")
     halves = [metrics_by_name(half) for half in reference.halves]
-    names_of = [reference.names_of_half(index) for index in range(len(halves))]
-    scan_names = [
-        names_of[index][place]
-        for index, half in enumerate(halves)
-        for place in half["matching"].subset("real")[0]
-    ]
+    scan_names: list[str] = []
+    for index, half in enumerate(halves):
+        names = reference.names_of_half(index)
+        places_of_half, _ = half["matching"].subset("real")
+        scan_names += [names[place] for place in places_of_half]
     matches = []
     for index in matching.squared_normalised.argsort().tolist():
         nearest = int(matching.nearest[index])

@@ -148,11 +148,11 @@ def verdict(rows: Sequence[MetricResult], floors: Floors, num_scenes: int) -> st
                 far.append((row.value / floor.value, row.name))
         elif row.name.endswith(_SHARES) and row.value < POOR_SHARE * floor.value:
             poor.append(f"{row.name} {row.value:.2g} (real scans {floor.value:.2g})")
-    parts = []
-    if near:
-        parts.append(f"near the floor in {', '.join(near)}")
+    near_text = f"near the floor in {', '.join(near)}"
     if poor:
-        return ", though ".join([f"not realistic: {', '.join(poor)}", *parts])
+        text = f"not realistic: {', '.join(poor)}"
+        return f"{text}, though {near_text}" if near else text
+    parts = [near_text] if near else []
     if far:
         worst = [f"{name} ({ratio:.3g} x)" for ratio, name in sorted(far, reverse=True)[:3]]
         plural = "" if len(far) == 1 else "s"

@@ -204,11 +204,11 @@ def minimum_matching(
                 if bounds[number, index] >= best:
                     break
                 sample = _places(sample_cells[index], side)
-                both = _mean_squared(tree, sample)
-                if both + there[number, index] < best:
-                    both += _mean_squared(_tree(sample), places)
-                    if both < best:
-                        best, nearest = both, int(index)
+                distance = _mean_squared(tree, sample)  # back; the way there is still a bound
+                if distance + there[number, index] < best:
+                    distance += _mean_squared(_tree(sample), places)
+                    if distance < best:
+                        best, nearest = distance, int(index)
             return best, nearest
 
         best, nearest = zip(*pool.map(match, range(len(references))), strict=True)
@@ -222,7 +222,7 @@ def _lower_bounds(
 
     Cells of blocks whose centres are d cells apart are at least ``d - sqrt(2) (block - 1)`` apart.
     """
-    blocks = -(-side // _BLOCK)
+    blocks = _num_blocks(side)
     rows = []
     for cells in clouds:
         occupied, counts = np.unique(_blocks(cells, side), return_counts=True)
@@ -244,9 +244,15 @@ def _lower_bounds(
     return np.hstack(bounds) * (1 - 1e-9)  # less what rounding may add
 
 
+def _num_blocks(side: int) -> int:
+    """Blocks along a side of so many cells, the last one perhaps cut off."""
+    return math.ceil(side / _BLOCK)
+
+
 def _blocks(cells: Cells, side: int) -> Cells:
+    """Block of each cell; blocks are numbered row by row, as cells are."""
     row, column = np.divmod(cells, side)
-    return row // _BLOCK * -(-side // _BLOCK) + column // _BLOCK
+    return row // _BLOCK * _num_blocks(side) + column // _BLOCK
 
 
 def _places(cells: Cells, side: int) -> NDArray[np.float64]:

@@ -136,14 +136,14 @@ class ReferenceStatistics:
                     f"{', '.join(self.spaces) or 'none'}: choose among these, or compute it again"
                 )
             stored, given = self.spaces[space.name], cards_of([space])[space.name]
-            differences = [
+            different = [
                 f"{key} {given.get(key)} not {stored.get(key)}"
                 for key in stored | given
                 if stored.get(key) != given.get(key)
             ]
-            if differences:
+            if different:
                 raise ValueError(
-                    f"{space.name} differs from the reference: {', '.join(differences)}; give the "
+                    f"{space.name} differs from the reference: {', '.join(different)}; give the "
                     "same weights and protocol, or compute the reference again"
                 )
 
@@ -321,7 +321,7 @@ def split_halves(names: Sequence[str]) -> dict[str, int]:
         min(halves, key=len).extend(scans)
     larger, smaller = sorted(halves, key=len, reverse=True)
     if len(larger) > 2 * len(smaller):  # only if it is a single drive: the others are no larger
-        cut = -(-len(names) // 2)
+        cut = (len(names) + 1) // 2
         smaller.extend(larger[cut:])
         del larger[cut:]
     return {name: half for half, scans in enumerate(halves) for name in scans}
@@ -329,5 +329,5 @@ def split_halves(names: Sequence[str]) -> dict[str, int]:
 
 def limits_of_halves(limit: int, sizes: tuple[int, int]) -> tuple[int, int]:
     """Divide ``limit`` scans between halves: equally, unless the second half lacks some."""
-    first = min(sizes[0], max(-(-limit // 2), limit - sizes[1]))
+    first = min(sizes[0], max((limit + 1) // 2, limit - sizes[1]))
     return first, min(sizes[1], limit - first)

@@ -52,7 +52,8 @@ class _FolderRun:
     def read(self, path: Path) -> tuple[PointCloud, WeatheredScan]:
         cloud = read_cloud(path, self.options.columns, self.options.drop_nan)
         cloud.check_metres()
-        key, scan = (self.options.seed, self.name(path)), recorded_scan(cloud)
+        key = (self.options.seed, self.name(path))
+        scan = recorded_scan(cloud)
         try:
             result = self.change(scan, key)
         except ValueError as error:
@@ -100,8 +101,12 @@ def change_scans(
     root, files = find_files(source)
     out, job = options.out, _FolderRun(root, change, options)
     paths = {job.name(path): path for path in files}
-    request |= {"source": str(root.resolve()), "seed": options.seed}
-    request |= {"columns": options.columns, "drop_nan": options.drop_nan}
+    request = request | {
+        "source": str(root.resolve()),
+        "seed": options.seed,
+        "columns": options.columns,
+        "drop_nan": options.drop_nan,
+    }
     _check_out(root, out, files, json_values(request))
     with only_writer(out / ".lock", f"writes scans to {out}", wait=True):
         write(out / _REQUEST, to_json(request))
@@ -116,9 +121,11 @@ def change_scans(
     if bad:
         with suppress(OSError):
             out.rmdir()
-        where = f", see {out / _REPORT}" if has_results else ""
-        more = f" ({len(bad)} of {len(paths)} scans cannot be used{where})"
-        raise ScanError(bad[0] + (more if len(paths) > 1 else ""))
+        message = bad[0]
+        if len(paths) > 1:
+            where = f", see {out / _REPORT}" if has_results else ""
+            message += f" ({len(bad)} of {len(paths)} scans cannot be used{where})"
+        raise ScanError(message)
     if options.show:
         _write_page(job, evenly(files, options.show))
     return _summary([lines[name] for name in paths], len(todo), out)
@@ -211,6 +218,7 @@ def _delete_results(line: dict[str, Any], out: Path) -> None:
 
 def _summary(lines: list[dict[str, Any]], num_now: int, out: Path) -> str:
     """Formats, shares of points and effects of all scans."""
+    # By format and columns, the description of the first scan that has them.
     kinds = {line["file"].partition(")")[0]: line["file"] for line in reversed(lines)}
     num_points = sum(line["points"] for line in lines)
     texts = [

@@ -60,9 +60,10 @@ def refuse_inside(out: Path, scans: Iterable[Path]) -> None:
 
 
 class EditSession:
-    """A checkpoint opened for one edit with ``num`` results; None is the default guidance.
+    """Checkpoint opened for one edit with ``num`` results.
 
-    Baselines can only complete scans: for them, ``editor`` raises a ValueError.
+    ``strength`` and ``window`` are of the guidance; None for their defaults. Baselines can only
+    complete scans: for them, ``editor`` raises a ValueError.
     """
 
     def __init__(
@@ -73,7 +74,8 @@ class EditSession:
         window: tuple[float, float] | None = None,
     ) -> None:
         self.options, self.num = options, num
-        strength, window = 0.5 if strength is None else strength, window or (0.0, 1.0)
+        strength = 0.5 if strength is None else strength
+        window = window or (0.0, 1.0)
         steps = EditSettings.steps if options.steps is None else options.steps
         self.settings = EditSettings(options.solver, steps, options.shift, strength, window)
         self.device = usable_device(options.device)
@@ -144,17 +146,13 @@ class EditSession:
         """Completions of a scan by a baseline; pixels that are not missing stay."""
         range_m, scan_intensity, _ = scan.pixels
         assert scan_intensity is not None
-        image, size = self.geometry.codec.to_image(range_m, scan_intensity), self.num
-        batches: list[SceneBatch] = [
-            self.baseline.complete(
-                image,
-                ~missing,
-                range(first, min(first + self.options.batch_size, size)),
-                self.options.seed,
-                resamplings=resamplings,
-            )
-            for first in range(0, size, self.options.batch_size)
-        ]
+        image = self.geometry.codec.to_image(range_m, scan_intensity)
+        batch_size, seed = self.options.batch_size, self.options.seed
+        batches: list[SceneBatch] = []
+        for first in range(0, self.num, batch_size):
+            indices = range(first, min(first + batch_size, self.num))
+            scenes = self.baseline.complete(image, ~missing, indices, seed, resamplings=resamplings)
+            batches.append(scenes)
 
         def joined(name: str) -> Tensor:
             return torch.cat([getattr(batch, name) for batch in batches]).cpu()
@@ -245,7 +243,8 @@ class EditSession:
         if self.baseline is not None:
             settings = {"steps": self.baseline.sampler.steps}
         request = dict(arguments)
-        request |= {"columns": options.columns} if options.columns else {}
+        if options.columns:
+            request["columns"] = options.columns
         request |= provenance(self.checkpoint, options, self.num, self.device, self.geometry)
         request |= {"command": command, "guided": guided, "settings": settings, **sources}
         return dict(json_values(request, default=str))  # paths as text
