@@ -59,7 +59,8 @@ def not_in_ring_order(reason: str, sensor: LidarSensor) -> ValueError:
     return ValueError(
         f"the scan is not stored ring after ring (highest first, each by growing azimuth from 0): "
         f"{reason}, for a sensor of {sensor.beams} beams; keep the order of the original file, or "
-        "use SphericalProjection, which needs no order"
+        "use projection: beams with a sensor that has a name or a YAML of `r3dpa data sensor`, or "
+        "projection: spherical, which need no order"
     )
 
 

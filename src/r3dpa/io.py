@@ -131,7 +131,8 @@ def versions(*packages: ModuleType) -> dict[str, str | None]:
 
 def command() -> str:
     """Command line of this process, paths reduced to their names."""
-    typed = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+    program = Path(sys.argv[0]).name
+    typed = shlex.join(["r3dpa" if program == "__main__.py" else program, *sys.argv[1:]])
     return re.sub(r"(?<![^\s='\"])[^\s='\"]*/(?=[^\s/'\"])", "", typed)
 
 

@@ -14,7 +14,7 @@ from tiny_stages import (
     train,
 )
 
-from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint
+from r3dpa.checkpoints import Checkpoint, NetworkState, convert, save_checkpoint
 from r3dpa.cli.runs import replay
 from r3dpa.modules import LossWeights
 from r3dpa.nn import AverageVelocitySiT
@@ -85,6 +85,14 @@ def test_the_decoder_gets_the_noise_of_the_step(tmp_path):
     without = stage_module("vae_alignment", weights=weights)
     train(without, NamedData(1))
     assert float(torch.stack(list(without.parts[0].values())).sum()) != pytest.approx(total)
+
+
+def test_weights_without_a_network_of_the_step_are_named(file, tmp_path):
+    ckpt = save(stage_module("joint"), tmp_path / "whole.safetensors")
+    part = tmp_path / "part.safetensors"
+    convert(ckpt, part, networks=["vae"])
+    with pytest.raises(ValueError, match=r"part\.safetensors has no network sit, which the step"):
+        replay(file, part)
 
 
 def test_a_stage_of_another_package_is_named(file, tmp_path):

@@ -3,6 +3,7 @@
 import contextlib
 import io
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -203,6 +204,23 @@ def test_overlays_are_no_stages():
         words, name = expand_preset(["joint", *preset, "--trainer.max_steps", "3"])
         assert name == "demo"
         assert words[-4:] == ["--run_dir", "runs/demo/joint", "--trainer.max_steps", "3"]
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"trainer: [1,2\n", "line 2: expected ',' or ']'"),
+        (b"", "is empty; a configuration has lines"),
+        (b"\xff\xfe\x00", "is no text"),
+    ],
+)
+@pytest.mark.parametrize("option", ["--config {}", "--config={}"])
+def test_a_configuration_that_cannot_be_read_is_named(option, content, message, tmp_path):
+    file = tmp_path / "mine.yaml"
+    file.write_bytes(content)
+    words = ["--config", str(conf_folder() / "trainer.yaml"), *option.format(file).split()]
+    with pytest.raises(ValueError, match=rf"mine\.yaml.*{re.escape(message)}"):
+        find_configs(words)
 
 
 @pytest.mark.parametrize("option", ["--config", "-c"])

@@ -59,9 +59,12 @@ def test_overfit_batches_takes_the_first_scans_again_and_again(data, fit):
     assert module.seen == [[0, 1], [2, 3], [0, 1], [2, 3]]
 
 
-def test_the_share_of_points_in_the_images_is_printed_once_before_training(data, caplog, fit):
+def test_the_share_of_points_in_the_images_is_printed_once_before_training(
+    data, caplog, fit, tmp_path
+):
+    further = shutil.copytree(data().scans, tmp_path / "further")
     with caplog.at_level("INFO"):
-        module = data(further_scans=data().scans)
+        module = data(further_scans=str(further))
         fit(module, 2)
     shares = re.findall(r"\S+% of the points of 1 scan within the range limits.*", caplog.text)
     scan = module.val_set.scans[0].read(module.sensor)[:, :3]
@@ -292,6 +295,12 @@ class TestNamedSensors:
         image = module.train_set[0]["range_image"]
         assert image.shape == (2, 16, 512)
         assert (image[1] > 0).any(dim=1).sum() >= 15
+
+    def test_a_scan_that_is_given_twice_is_refused(self, folders):
+        """It could be held out, and trained on all the same."""
+        module = LidarDataModule(str(folders / "own"), further_scans=str(folders), val_every=2)
+        with pytest.raises(ValueError, match=r"further_scans names .*\.bin, which is one of scans"):
+            module.split()
 
     def test_further_scans_are_trained_on_and_never_held_out(self, folders):
         module = LidarDataModule(

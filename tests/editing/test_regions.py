@@ -102,6 +102,8 @@ def test_a_sector_and_the_rest_of_the_turn_share_no_pixel_and_leave_none():
         (lambda: box3d(COARSE, (10, 0, math.nan), (4, 1, 2)), "finite"),
         (lambda: box3d(COARSE, (10, 0), (4, 1, 2)), "needs x, y, z"),
         (lambda: dropped_beams(COARSE, range(4)), "selects nothing"),
+        (lambda: dropped_beams(COARSE, [-1]), "row -1 is kept, but the images have rows 0 to 3"),
+        (lambda: dropped_beams(COARSE, [0, 4]), "row 4 is kept"),
         (lambda: dropped_beams(COARSE, []), "selects all"),
         (lambda: sensor_pair(COARSE, COARSE), "selects nothing"),
         (lambda: sensor_pair(COARSE, ABOVE), "selects all"),

@@ -288,6 +288,7 @@ def test_unlike_evaluations_are_noted():
         "not the same protocol: a, b",
         "not the same number of scenes: 500 of a; 10,000 of b",
     ]
+    assert EvaluationTable([a, b]).marks("FRID") == ["", ""]
     assert EvaluationTable([a, replace(a, label="b")]).notes == []
 
 

@@ -8,6 +8,8 @@ from importlib.resources import files
 from pathlib import Path
 from typing import NamedTuple
 
+import yaml
+
 from r3dpa.cli.messages import suggestion
 
 DEFAULT_PRESET = "kitti360"
@@ -34,16 +36,39 @@ def shipped(path: str | Path) -> Path:
 
 
 def find_configs(words: Sequence[str]) -> list[str]:
-    """Replace the files after ``--config`` or ``-c`` by those that :func:`shipped` finds."""
+    """Replace the files after ``--config`` or ``-c`` by those that :func:`shipped` finds.
+
+    Raises:
+        ValueError: If one is empty or no YAML: the parser itself would not name it.
+    """
     replaced: list[str] = []
     for word in words:
         name, _, value = word.partition("=")
-        if name in ("--config", "-c") and value.startswith("conf/"):
-            word = f"{name}={shipped(value)}"
-        elif replaced and replaced[-1] in ("--config", "-c") and word.startswith("conf/"):
-            word = str(shipped(word))
+        if name in ("--config", "-c") and value:
+            word = f"{name}={_checked(value)}"
+        elif replaced and replaced[-1] in ("--config", "-c"):
+            word = _checked(word)
         replaced.append(word)
     return replaced
+
+
+def _checked(config: str) -> str:
+    """Name of a configuration; refuses a file that is empty or no YAML."""
+    if config.startswith("conf/"):
+        config = str(shipped(config))
+    if not Path(config).is_file():
+        return config  # the parser refuses it, or it is YAML itself
+    try:
+        content = yaml.safe_load(Path(config).read_text(encoding="utf-8"))
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{config}: is no text") from error
+    except yaml.YAMLError as error:
+        line = getattr(error, "problem_mark", None)
+        where = f", line {line.line + 1}" if line else ""
+        raise ValueError(f"{config}{where}: {getattr(error, 'problem', 'is no YAML')}") from error
+    if content is None:
+        raise ValueError(f"{config}: is empty; a configuration has lines such as 'trainer:'")
+    return config
 
 
 def stage_files() -> dict[str, Path]:

@@ -114,6 +114,10 @@ def replay(file: Path, ckpt: Path, device: str = "cpu") -> str:
         raise ValueError(
             f"{file} is of stage {saved['stage']}, but only {', '.join(stages)} can be repeated"
         )
+    if missing := {"vae", "sit"} - set(weights.networks):
+        raise ValueError(
+            f"{ckpt} has no network {min(missing)}, which the step needs: give a .ckpt of the run"
+        )
     known = {"vae", "sit", "latent_norm", "discriminator", "thin_decoder"} & set(weights.networks)
     networks: Any = {name: weights.network(name).build() for name in known}
     settings = LossWeights(**saved["weights"])

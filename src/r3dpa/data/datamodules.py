@@ -225,7 +225,13 @@ class LidarDataModule(LoaderModule):
             held_out = set(scans[:: self.val_every] if self.val_every else [])
         train = [scan for scan in scans if scan not in held_out]
         if self.further_scans is not None:
-            train = self.repeats * train + find_scans(self.further_scans)
+            further = find_scans(self.further_scans)
+            if both := sorted({scan.path for scan in scans} & {scan.path for scan in further}):
+                raise ValueError(
+                    f"further_scans names {both[0]}, which is one of scans too: a held-out scan "
+                    "would be trained on. Name other scans"
+                )
+            train = self.repeats * train + further
         return train, sorted(held_out)
 
     def limited_split(self) -> tuple[list[Scan], list[Scan]]:

@@ -164,6 +164,8 @@ def _ray_spans(
 def dropped_beams(projection: Projection, kept: Sequence[int]) -> Tensor:
     """Pixels ``(H, W)`` bool of all rows that ``kept`` does not list."""
     beams = projection.sensor.beams
+    if outside := [row for row in kept if not 0 <= row < beams]:
+        raise ValueError(f"row {outside[0]} is kept, but the images have rows 0 to {beams - 1}")
     missing = torch.ones(beams, projection.sensor.columns, dtype=torch.bool)
     missing[list(kept)] = False
     return check_mask(missing, f"{len(set(kept))} of {beams} beams kept: the mask of the others")

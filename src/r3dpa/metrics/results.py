@@ -254,14 +254,18 @@ class EvaluationTable:
         return {name: column for name, column in columns.items() if any(column)}
 
     def marks(self, metric: str) -> list[Mark]:
-        """Return the mark of each evaluation in a column."""
+        """Return the mark of each evaluation in a column; none where references differ."""
         marks: list[Mark] = [""] * len(self.evaluations)
         ranked = {
             index: result
             for index, result in enumerate(self.columns[metric])
             if result is not None and not self.evaluations[index].published
         }
-        if len(ranked) < 2:
+        abouts = [self.evaluations[index].about for index in ranked]
+        same = all(
+            about[key] == abouts[0][key] for about in abouts for key in ("protocol", "reference")
+        )
+        if len(ranked) < 2 or not same:
             return marks
         places: tuple[Mark, ...] = ("best", "second")
         for place in places:
