@@ -199,6 +199,6 @@ class TestInterruptedRun:
 def test_options_of_a_model_are_refused_without_one(tmp_path):
     """Without it they would be ignored: the mixture has its own numbers."""
     words = ["bench", "sampling", "--out", str(tmp_path / "out"), "--scenes", "4", "--nfe", "[4]"]
-    with pytest.raises(ValueError, match="--scenes, --nfe: for a model, give --ckpt"):
+    with pytest.raises(ValueError, match="--num, --nfe: for a model, give --ckpt"):
         main(words)
     assert not (tmp_path / "out").exists()

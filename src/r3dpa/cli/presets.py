@@ -56,8 +56,8 @@ def _checked(config: str) -> str:
     """Name of a configuration; refuses a file that is empty or no YAML."""
     if config.startswith("conf/"):
         config = str(shipped(config))
-    if not Path(config).is_file():
-        return config  # the parser refuses it, or it is YAML itself
+    if not config.endswith((".yaml", ".yml")) or not Path(config).is_file():
+        return config  # the parser refuses it, or it is the text of one
     try:
         content = yaml.safe_load(Path(config).read_text(encoding="utf-8"))
     except UnicodeDecodeError as error:
