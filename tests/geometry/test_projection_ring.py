@@ -147,9 +147,7 @@ def test_points_in_another_order_are_refused(missing):
     points, ring = scan_of()
     kept = ~torch.isin(ring, torch.tensor(missing))
     for wrong in in_ring_orders(points[kept], ring[kept]).values():
-        with pytest.raises(
-            ValueError, match=r"ring after ring.*projection: spherical, which"
-        ):
+        with pytest.raises(ValueError, match=r"ring after ring.*projection: spherical, which"):
             RING.pixel_of(wrong)
         if not missing:
             with pytest.raises(ValueError, match="not stored ring after ring"):
