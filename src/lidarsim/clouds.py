@@ -327,7 +327,7 @@ def read_cloud(
         reason = f"is damaged or of another layout ({first_line(error)})"
         raise ScanError(f"{path}: {reason}") from error
     names = known_columns(path, table)
-    labels, label_path = _labels(path, len(table)) if with_labels else (None, None)
+    labels, label_path = labels_beside(path, len(table)) if with_labels else (None, None)
     is_finite = np.all([np.isfinite(table[name]) for name in names.values()], axis=0)
     if is_finite.all():
         return PointCloud(table, names, labels, CloudFile(path, kind, pack, data, label_path))
@@ -442,7 +442,12 @@ def label_path_of(path: Path) -> Path | None:
     return next((place for place in places if place.is_file()), None)
 
 
-def _labels(path: Path, num_points: int) -> tuple[NDArray[np.uint32] | None, Path | None]:
+def labels_beside(path: Path, num_points: int) -> tuple[NDArray[np.uint32] | None, Path | None]:
+    """Labels ``(P,)`` of a scan as its file has them, and this file; None without one.
+
+    Raises:
+        ScanError: If there is another number of labels.
+    """
     place = label_path_of(path)
     if place is None:
         return None, None

@@ -195,7 +195,7 @@ class Conditions:
 
     Args:
         visibility_m: Meteorological optical range (MOR): where a beam keeps 5 % of its power; at
-            least 1 (the densest fogs have some 10 m), infinity without fog.
+            least 1 (the densest fogs have some 10 m), infinity (typed ``.inf``) without fog.
         rain_mm_h: Rain rate, at most 500 (a cloudburst has 100).
         snow_mm_h: Snow rate, as millimetres of water, likewise.
         water_film_mm: Depth of the water on the ground.

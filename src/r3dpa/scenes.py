@@ -116,7 +116,11 @@ def _points_of_scan(scan: ScanLike) -> tuple[Any, ArrayLike | None]:
 
 
 def check_intensities(pixels: Pixels, codec: RangeCodec) -> None:
-    """Refuse intensities above 1, where images of the codec have a channel for them."""
+    """Refuse intensities above 1, where images of the codec have a channel for them.
+
+    Raises:
+        ValueError: With the largest intensity.
+    """
     intensity = pixels.intensity
     uses_intensity = codec.intensity_channel or codec.reflectance
     if uses_intensity and intensity is not None and intensity.max() > 1:

@@ -290,12 +290,6 @@ def test_a_scan_without_a_point_left_is_not_written(folder, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_infinity_is_given_as_the_help_shows_it(folder, tmp_path):
-    words = ["--weather.visibility_m", "inf", "--weather.rain_mm_h", 20]
-    weather(folder / "b", tmp_path / "out", *words)
-    assert report(tmp_path / "out")
-
-
 BAD = {
     "none": ([], "give an option such as --weather.visibility_m 60 or --weather.rain_mm_h 10"),
     "idle": (["--effects.range_noise", "on"], "no weather is given, so that scans would stay"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,6 +101,11 @@ class LidarSensor:
                 f"{self.beams} x {self.columns} range image"
             )
         return self.beams // rows, self.columns // columns
+
+    def cell_of(self, row: Any, column: Any, grid_size: tuple[int, int]) -> Any:
+        """Cells of a grid, numbered row after row, of pixels given by whole numbers or arrays."""
+        cell_rows, cell_columns = self.cell_size(grid_size)
+        return row // cell_rows * grid_size[1] + column // cell_columns
 
     @property
     def inclination_max_rad(self) -> float:

@@ -102,9 +102,8 @@ class StepGuard(L.Callback):
         sizes = torch._foreach_norm(moved, torch.inf) if moved else ()
         bad_buffers = ~torch.stack([norms.new_zeros(()), *sizes]).isfinite().all()
         bad_gradients = ~norms.isfinite().all()
-        stop = torch.full_like(bad_losses, int(self.stop), dtype=torch.int32)
-        flags = [bad_losses.int(), bad_gradients.int(), bad_buffers.int()]
-        shared = torch.stack([*flags, stop])
+        flags = torch.stack([bad_losses, bad_gradients, bad_buffers]).int()
+        shared = torch.cat([flags, flags.new_full((1,), self.stop)])
         if dist.is_available() and dist.is_initialized() and dist.get_world_size() > 1:
             dist.all_reduce(shared, dist.ReduceOp.MAX)  # one process skips: all skip
         # Read at once, as each read makes the host wait for the device.

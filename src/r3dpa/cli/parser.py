@@ -104,13 +104,11 @@ class Parser(ArgumentParser):
         """Parse words, in which classes may have the import paths of earlier versions.
 
         ``None`` is read as ``null``: jsonargparse itself writes it so for the parser of a class.
-        ``inf``, as help texts show it, is ``.inf`` in YAML.
         """
-        in_yaml = {"None": "null", "inf": ".inf", "-inf": "-.inf"}
         words = []
         for word in sys.argv[1:] if args is None else args:
             name, equals, value = word.rpartition("=")  # --option=class or class
-            value = in_yaml.get(value) or current_path(value)
+            value = "null" if value == "None" else current_path(value)
             words.append(f"{name}{equals}{value}")
         return super().parse_args(words, *others, **settings)
 

@@ -63,8 +63,8 @@ def _checked(config: str) -> str:
     except UnicodeDecodeError as error:
         raise ValueError(f"{config}: is no text") from error
     except yaml.YAMLError as error:
-        line = getattr(error, "problem_mark", None)
-        where = f", line {line.line + 1}" if line else ""
+        mark = getattr(error, "problem_mark", None)
+        where = f", line {mark.line + 1}" if mark else ""
         raise ValueError(f"{config}{where}: {getattr(error, 'problem', 'is no YAML')}") from error
     if content is None:
         raise ValueError(f"{config}: is empty; a configuration has lines such as 'trainer:'")

@@ -115,13 +115,14 @@ class LidarDataset(Dataset[dict[str, Any]]):
         if self.images is not None:
             return self.images.read(scan)
         read, codec = scan.read(), self.codec
+        has_intensity = codec.reflectance or codec.intensity_channel
+        if has_intensity:
+            _check_intensities(scan.path, read)
         points = torch.from_numpy(read if change is None else change(read))
         # Labels are of the points as they were read: a data module refuses both together.
         labels = torch.from_numpy(read_labels(scan.path, len(read))) if codec.num_classes else None
         try:
-            if codec.reflectance or codec.intensity_channel:
-                _check_intensities(scan.path, read)
-            if codec.reflectance or codec.intensity_channel or codec.num_classes:
+            if has_intensity or codec.num_classes:
                 pixels = project_pixels(points, self.projection, labels)
             else:
                 pixels = Pixels(range_image(points[:, :3], self.projection)[0])

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lidarsim.cloud_formats import ScanError, read_bytes
-from lidarsim.clouds import PointCloud, label_path_of
+from lidarsim.cloud_formats import ScanError
+from lidarsim.clouds import PointCloud, labels_beside
 from r3dpa.io import atomic_path
 
 #: Names by KITTI-360 class id; every other id counts as unlabelled.
@@ -97,6 +97,10 @@ def read_labels(scan: str | Path, num_points: int) -> NDArray[np.int64]:
     Returns:
         ``(P,)`` KITTI-360 class in the lower 16 bits, see :data:`CLASS_NAMES`, 0 without a label;
         number of the object in the upper, 0 for none.
+
+    Raises:
+        ScanError: If there is no such file, it has another number of labels, or it holds ids that
+            SemanticKITTI does not have.
     """
     labels = find_labels(scan, num_points)
     if labels is None:
@@ -112,13 +116,8 @@ def read_labels(scan: str | Path, num_points: int) -> NDArray[np.int64]:
 def find_labels(scan: str | Path, num_points: int) -> NDArray[np.int64] | None:
     """Labels ``(P,)`` as of :func:`read_labels`; None for a scan without a label file."""
     scan = Path(scan)
-    path = label_path_of(scan)
-    if path is None:
-        return None
-    data = read_bytes(path)
-    if len(data) != 4 * num_points:
-        raise ScanError(f"{path} holds {len(data) / 4:g} labels, but its scan {num_points} points")
-    return _kitti_360(np.frombuffer(data, dtype="<u4"), scan)
+    labels, path = labels_beside(scan, num_points)
+    return None if labels is None else _kitti_360(labels, scan, path)
 
 
 def labels_of_cloud(cloud: PointCloud) -> NDArray[np.int64] | None:
@@ -127,12 +126,13 @@ def labels_of_cloud(cloud: PointCloud) -> NDArray[np.int64] | None:
         return None
     if cloud.file is None:
         return cloud.labels.astype(np.int64)
-    return _kitti_360(cloud.labels, cloud.file.path)
+    return _kitti_360(cloud.labels, cloud.file.path, cloud.file.label_path)
 
 
 def classes_as_of_cloud(classes: NDArray[np.int64], cloud: PointCloud) -> NDArray[np.int64]:
     """KITTI-360 classes ``(P,)`` by the ids that the labels of a cloud have; 0 for unknown ones."""
-    if cloud.file is None or not _has_semantic_kitti(cloud.file.path):
+    file = cloud.file
+    if file is None or not _is_semantic_kitti(file.path, file.label_path):
         return classes
     table = np.zeros(1 << 16, np.int64)
     for name, numbers in _SEMANTIC_KITTI_IDS.items():
@@ -146,25 +146,23 @@ def write_labels(path: str | Path, labels: Tensor) -> None:
         temporary.write_bytes(labels.numpy().astype("<u4").tobytes())
 
 
-def _kitti_360(labels: NDArray[np.uint32], scan: Path) -> NDArray[np.int64]:
-    """Labels with classes of KITTI-360 of those in the file beside a scan."""
+def _kitti_360(labels: NDArray[np.uint32], scan: Path, path: Path | None) -> NDArray[np.int64]:
+    """Labels in the file ``path`` of a scan, with the classes of KITTI-360."""
     numbers = labels.astype(np.int64)
-    if not _has_semantic_kitti(scan):
+    if not _is_semantic_kitti(scan, path):
         return numbers
     table = np.full(1 << 16, -1)
     table[list(_SEMANTIC_KITTI)] = list(_SEMANTIC_KITTI.values())
     classes = table[numbers & 0xFFFF]
     if (classes < 0).any():
         unknown = sorted(set((numbers[classes < 0] & 0xFFFF).tolist()))
-        raise ScanError(
-            f"{label_path_of(scan)} holds {unknown[:5]}, which are no classes of SemanticKITTI"
-        )
+        raise ScanError(f"{path} holds {unknown[:5]}, which are no classes of SemanticKITTI")
     return classes | numbers >> 16 << 16
 
 
-def _has_semantic_kitti(scan: Path) -> bool:
+def _is_semantic_kitti(scan: Path, path: Path | None) -> bool:
     """Whether the label file of a scan lies where SemanticKITTI has it."""
-    folder, path = scan.absolute().parent, label_path_of(scan)
+    folder = scan.absolute().parent
     return (
         folder.name == "velodyne" and path is not None and path.parent == folder.parent / "labels"
     )

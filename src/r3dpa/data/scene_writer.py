@@ -193,7 +193,7 @@ class SceneWriter:
                 f"{self.out} holds scenes already; give another --out or --overwrite true"
             )
         stored = {key: metadata.get(key) for key in self._request}
-        if different := self._differences(stored):
+        if different := self._differences(stored, num_done):
             raise ValueError(
                 f"{self.out} holds {num_done} scenes of another request ({different}); give "
                 "another --out or --overwrite true"
@@ -201,12 +201,12 @@ class SceneWriter:
         self._start_journal(num_done, round(nfe * num_done))
         metadata_path.unlink()
 
-    def _differences(self, stored: dict[str, Any], with_num: bool = False) -> str:
-        """How a stored request differs in what scenes depend on; not on how many are made at once.
+    def _differences(self, stored: dict[str, Any], num_done: int) -> str:
+        """How the request that made ``num_done`` scenes differs in what scenes depend on.
 
-        Their number counts only ``with_num``: scenes can be added.
+        They do not depend on how many are made at once, and more can be added.
         """
-        free = {"batch_size"} if with_num else {"batch_size", "num"}
+        free = {"batch_size"} if num_done > self.num else {"batch_size", "num"}
         request = {name: value for name, value in self._request.items() if name not in free}
         before = {name: value for name, value in stored.items() if name not in free}
         return "; ".join(differences(before, request))
@@ -221,8 +221,7 @@ class SceneWriter:
             raise ValueError(
                 f"{self._journal.path}: is damaged ({error!r}); give --overwrite true to start anew"
             ) from error
-        fewer_wanted = num_done > self.num
-        if num_done and (different := self._differences(stored, with_num=fewer_wanted)):
+        if num_done and (different := self._differences(stored, num_done)):
             raise ValueError(
                 f"{self.out} holds {num_done} scenes of an unfinished run of another request "
                 f"({different}); the same request completes it, --overwrite true starts anew"

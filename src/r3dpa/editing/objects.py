@@ -342,11 +342,9 @@ def _cells_of_classes(
     grid_size: tuple[int, int],
 ) -> Iterator[tuple[str, Tensor, Tensor, int]]:
     """Cells of a scan ``(P, 4)`` by class: name, shares ``(N,)``, features ``(N, D)``, points."""
-    cell_rows, cell_columns = projection.sensor.cell_size(grid_size)
     lift = getattr(extractor, "lift", torch.nn.Identity())
     values = extractor.point_features([extractor.prepare(points)])[0]
-    row, column = projection.pixel_of(points[:, :3])
-    cell = row // cell_rows * grid_size[1] + column // cell_columns
+    cell = projection.sensor.cell_of(*projection.pixel_of(points[:, :3]), grid_size)
     within = in_range(points[:, :3], projection.sensor)
     totals = torch.bincount(cell[within], minlength=grid_size[0] * grid_size[1])
     for number, name in CLASS_NAMES.items():

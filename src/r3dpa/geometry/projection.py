@@ -315,12 +315,10 @@ def pool_cells(
             "points must be (P, 3) and values (P, F), got "
             f"{tuple(points.shape)} and {tuple(values.shape)}"
         )
-    grid_rows, grid_columns = grid_size
-    cell_rows, cell_columns = projection.sensor.cell_size(grid_size)
+    projection.sensor.cell_size(grid_size)  # refuses a grid before points are projected
     kept = in_range(points, projection.sensor) if range_filter else points.isfinite().all(dim=-1)
-    row, column = projection.pixel_of(points)
-    cell = row // cell_rows * grid_columns + column // cell_columns
-    num_cells = grid_rows * grid_columns
+    cell = projection.sensor.cell_of(*projection.pixel_of(points), grid_size)
+    num_cells = math.prod(grid_size)
     # Points that do not count have a cell of their own: leaving them out would copy all values.
     cell = torch.where(kept, cell, num_cells)
 
@@ -329,7 +327,16 @@ def pool_cells(
 
 
 def pool_by_cell(cell: Tensor, values: Tensor, num_cells: int) -> tuple[Tensor, Tensor]:
-    """Mean of values ``(P, F)`` over cells by their number ``(P,)``, as of :func:`pool_cells`."""
+    """Mean of values over cells, formed as in :func:`pool_cells`.
+
+    Args:
+        cell: ``(P,)`` int64 number of the cell of each value, in ``[0, num_cells)``.
+        values: ``(P, F)`` floating point.
+        num_cells: Number of cells.
+
+    Returns:
+        ``means`` ``(num_cells, F)`` and ``counts`` ``(num_cells,)``, zeros in empty cells.
+    """
     counts = torch.bincount(cell, minlength=num_cells)
     num_bags = (counts + _BAG - 1) // _BAG
     bag_cell = torch.repeat_interleave(num_bags)

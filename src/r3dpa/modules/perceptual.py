@@ -63,9 +63,8 @@ class PerceptualLoss:
         pixels = self.geometry.codec.pixels_of(image, projection.sensor)
         returns = pixels.range_m > 0
         points = unproject(pixels.range_m, projection)[returns]
-        cell_rows, cell_columns = projection.sensor.cell_size(self.geometry.grid_size)
         row, column = returns.nonzero().unbind(dim=1)
-        cell = row // cell_rows * self.geometry.grid_size[1] + column // cell_columns
+        cell = projection.sensor.cell_of(row, column, self.geometry.grid_size)
         if pixels.intensity is None:
             intensity = torch.full_like(points[:, 0], network.grid.intensity_mean)
         else:
