@@ -14,6 +14,7 @@ from tiny_stages import (
     train,
 )
 
+from r3dpa.callbacks.bad_batches import read_bad_batch
 from r3dpa.checkpoints import Checkpoint, NetworkState, convert, save_checkpoint
 from r3dpa.cli.runs import replay
 from r3dpa.modules import LossWeights
@@ -85,6 +86,16 @@ def test_the_decoder_gets_the_noise_of_the_step(tmp_path):
     without = stage_module("vae_alignment", weights=weights)
     train(without, NamedData(1))
     assert float(torch.stack(list(without.parts[0].values())).sum()) != pytest.approx(total)
+
+
+def test_the_encoder_sees_what_it_saw_in_the_step(tmp_path):
+    options = {"weights": LossWeights(vae_alignment=0.0), "further_dropout": 0.5}
+    module = guarded("vae_alignment", [0], constant_loss, **options)
+    train(module, NamedData(1), default_root_dir=tmp_path)
+    (file,) = (tmp_path / "bad_batches").iterdir()
+    saved = read_bad_batch(file)
+    assert saved["further_dropout"] == 0.5
+    assert torch.equal(saved["draws"].further, module.draw_path(2, 0).further)
 
 
 def test_weights_without_a_network_of_the_step_are_named(file, tmp_path):

@@ -19,7 +19,13 @@ from r3dpa.checkpoints import (
     with_further_channels,
     without_further_channels,
 )
-from r3dpa.geometry import NUM_CLASSES, RangeCodec, ScanGeometry, SphericalProjection
+from r3dpa.geometry import (
+    NUM_CLASSES,
+    UNKNOWN_CLASS,
+    RangeCodec,
+    ScanGeometry,
+    SphericalProjection,
+)
 from r3dpa.losses import centred_features, class_errors, masked_mean, return_loss
 from r3dpa.modules import LossWeights, OptimizerConfig, VAEAlignment
 from r3dpa.modules.base import check_image
@@ -64,7 +70,8 @@ def range_module(modes, discriminator=None, labelled=False, refinement=0, **kwar
     further = {"intensity": True, "num_classes": NUM_CLASSES} if labelled else {}
     further |= {"refinement": refinement}
     vae = VAE(2, 4, 32, (1,), (), 1, stem=(2, 2), modes=modes, **further)
-    given = {"latent_noise", "init_networks", "train_encoder"} & kwargs.keys()
+    names = {"latent_noise", "further_dropout", "init_networks", "train_encoder"}
+    given = names & kwargs.keys()
     settings = {name: kwargs.pop(name) for name in given}
     weights = LossWeights(vae_alignment=0.0, **kwargs)
     settings |= {"weights": weights, "optimizer": OptimizerConfig(lr=3e-3)}
@@ -127,6 +134,31 @@ def test_noise_replaces_a_share_of_the_latents_by_their_own_spread():
     assert module.decoder_latents(latents, draws) is latents
     with pytest.raises(ValueError, match=r"latent_noise must lie in \[0, 1\], got 1.5"):
         range_module(2, latent_noise=1.5)
+
+
+def test_the_encoder_sees_some_samples_without_intensity_and_some_without_classes():
+    module = range_module(2, labelled=True, further_dropout=0.5)
+    image = LabelledData(1).batches[0]["range_image"]
+    before = image.clone()
+    noise = torch.zeros(2, 4, 4, 8)
+    shares = torch.tensor([[0.4, 0.5], [0.5, 0.4]])
+    draws = PathDraws(noise, torch.zeros(2), noise, torch.zeros(2), shares)
+    no_intensity, no_classes = module.encoder_images(image, draws)
+    assert torch.equal(no_intensity[[0, 1, 3]], before[0, [0, 1, 3]])
+    assert torch.equal(no_classes[:3], before[1, :3])
+    assert torch.equal(no_intensity[2], torch.full((8, 16), -1.0))
+    assert torch.equal(no_classes[3], torch.full((8, 16), float(UNKNOWN_CLASS)))
+    assert torch.equal(image, before)
+    module.further_dropout = 0.0
+    assert module.encoder_images(image, draws) is image
+    with pytest.raises(ValueError, match=r"further_dropout must lie in \[0, 1\], got -1"):
+        range_module(2, further_dropout=-1)
+
+
+def test_the_decoder_learns_what_the_encoder_did_not_see():
+    module = train(range_module(2, labelled=True, further_dropout=1.0), LabelledData(20))
+    for name in ("intensity", "classes"):
+        assert 0.01 < module.parts[-1][name] < module.parts[0][name] - 0.01, name
 
 
 def test_only_the_decoder_sees_noisy_latents():

@@ -36,6 +36,7 @@ def save_bad_batch(
         "losses": losses,
         "weights": weights,
         "latent_noise": module.latent_noise,
+        "further_dropout": module.further_dropout,
         "batch": {key: value.cpu() for key, value in tensors.items()},
         "draws": {key: value.cpu() for key, value in draws._asdict().items()},
     }

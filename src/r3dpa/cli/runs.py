@@ -126,6 +126,7 @@ def replay(file: Path, ckpt: Path, device: str = "cpu") -> str:
         weights=settings,
         path=saved["path"],
         latent_noise=saved["latent_noise"],
+        further_dropout=saved.get("further_dropout", 0.0),
     ).to(device)
     if weights.geometry is not None:
         module.geometry = ScanGeometry.from_dict(dict(weights.geometry))

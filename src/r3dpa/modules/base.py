@@ -26,9 +26,10 @@ from r3dpa.data.datasets import LidarBatch
 from r3dpa.flow import Interpolant, PerturbedAttention
 from r3dpa.flow.sampler import SamplerConfig
 from r3dpa.generation import SceneGenerator
-from r3dpa.geometry import ScanGeometry
+from r3dpa.geometry import UNKNOWN_CLASS, ScanGeometry
 from r3dpa.io import text_table
 from r3dpa.modules.checks import (
+    check_features,
     check_image,
     check_latents,
     check_path,
@@ -37,13 +38,7 @@ from r3dpa.modules.checks import (
 )
 from r3dpa.modules.perceptual import PerceptualLoss
 from r3dpa.modules.settings import LossWeights, OptimizerConfig, PathName, TimeSampling
-from r3dpa.modules.stage import (
-    PathDraws,
-    Stage,
-    frozen,
-    networks_as_settings,
-    zero_loss,
-)
+from r3dpa.modules.stage import PathDraws, Stage, frozen, networks_as_settings, zero_loss
 from r3dpa.nn import EMA, VAE, LatentNorm, PatchDiscriminator, Posterior, SiT, VelocityNetwork
 
 
@@ -74,6 +69,8 @@ class GenerativeModule(Stage):
         keep_projector: Keep the RGB model's projection head where its shape fits.
         latent_noise: Largest share of noise in the latents that the decoder learns from, see
             :meth:`decoder_latents`, in the stages that train it; 0 for none.
+        further_dropout: Share of samples whose classes the encoder does not see, and of those whose
+            intensity it does not, see :meth:`encoder_images`, in the stages that train it.
         guidance: Perturbed-attention guidance of generated scenes, recorded in checkpoints.
         seed: Key of the training draws.
         channels_last: Keep images and kernels of VAE and discriminator with their channels next to
@@ -104,14 +101,19 @@ class GenerativeModule(Stage):
         rgb_weights: str | None = None,
         keep_projector: bool = False,
         latent_noise: float = 0.0,
+        further_dropout: float = 0.0,
         guidance: PerturbedAttention | None = None,
         seed: int = 0,
         channels_last: bool = False,
         compile: bool = False,
         init_other_sensor: bool = False,
     ) -> None:
-        if not 0 <= latent_noise <= 1:
-            raise ValueError(f"latent_noise must lie in [0, 1], got {latent_noise}")
+        for name, share in {
+            "latent_noise": latent_noise,
+            "further_dropout": further_dropout,
+        }.items():
+            if not 0 <= share <= 1:
+                raise ValueError(f"{name} must lie in [0, 1], got {share}")
         super().__init__(optimizer, seed, time_sampling)
         with networks_as_settings():
             self.save_hyperparameters()
@@ -132,6 +134,7 @@ class GenerativeModule(Stage):
         self.channels_last = channels_last
         self.compiles = compile
         self.latent_noise = latent_noise
+        self.further_dropout = further_dropout
         self.guidance = guidance
         self.ema: EMA | None = None
         if self.trains_velocity:
@@ -190,28 +193,7 @@ class GenerativeModule(Stage):
         check_image(self.vae, geometry.codec)
         check_latents(self.vae, self.sit, (sensor.beams, sensor.columns))
         if stage != "predict" and self.needs_features():
-            self._check_features(geometry, datamodule)
-
-    def _check_features(self, geometry: ScanGeometry, datamodule: object) -> None:
-        """Refuse data without feature grids, or with grids of another size than the network's."""
-        if getattr(datamodule, "features_dir", "") is None:
-            raise ValueError(
-                f"stage {self.stage} aligns with 3D features, but the data module has none; give "
-                "it an extractor or features_dir, or set the alignment weights to 0"
-            )
-        if tuple(geometry.grid_size) != tuple(self.sit.grid_size):
-            raise ValueError(
-                f"feature grids are {geometry.grid_size}, but the {type(self.sit).__name__} has "
-                f"{tuple(self.sit.grid_size)} tokens; set --data.init_args.grid_size to the "
-                f"latter"
-            )
-        feature_dim = getattr(datamodule, "feature_dim", self.sit.feature_dim)
-        if feature_dim != self.sit.feature_dim:
-            raise ValueError(
-                f"features have width {feature_dim}, but the {type(self.sit).__name__} has "
-                f"feature_dim {self.sit.feature_dim}; set "
-                "--model.init_args.sit.init_args.feature_dim to the former"
-            )
+            check_features(self.sit, geometry, datamodule, self.stage)
 
     def on_fit_start(self) -> None:
         """Load the stage before, unless this run goes on from a checkpoint of its own."""
@@ -360,6 +342,22 @@ class GenerativeModule(Stage):
         fake = self.discriminator(self.vae.scan_of(prediction).detach())
         loss = losses.discriminator_loss(real, fake)
         return {"discriminator": weights.discriminator * loss}
+
+    def encoder_images(self, image: Tensor, draws: PathDraws) -> Tensor:
+        """Range images ``(B, C, H, W)`` as the encoder sees them in training.
+
+        With ``further_dropout`` some have no intensity and some no classes, as those of scans that
+        were recorded without. The decoder learns both from all.
+        """
+        if self.further_dropout == 0:
+            return image
+        no_intensity, no_classes = (draws.further < self.further_dropout).unbind(dim=1)
+        image = image.clone()
+        if self.vae.intensity:
+            image[:, self.vae.in_channels].masked_fill_(no_intensity[:, None, None], -1.0)
+        if self.vae.num_classes:
+            image[:, -1].masked_fill_(no_classes[:, None, None], UNKNOWN_CLASS)
+        return image
 
     def decoder_latents(self, latents: Tensor, draws: PathDraws) -> Tensor:
         """Raw latents ``(B, C, h, w)`` that the decoder learns to decode.

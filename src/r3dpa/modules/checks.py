@@ -45,6 +45,29 @@ def check_latents(vae: VAE | ImageVAE, sit: VelocityNetwork, image_size: tuple[i
         )
 
 
+def check_features(
+    sit: VelocityNetwork, geometry: ScanGeometry, datamodule: object, stage: str
+) -> None:
+    """Refuse data without feature grids, or with grids of another size than the network's."""
+    if getattr(datamodule, "features_dir", "") is None:
+        raise ValueError(
+            f"stage {stage} aligns with 3D features, but the data module has none; give "
+            "it an extractor or features_dir, or set the alignment weights to 0"
+        )
+    if tuple(geometry.grid_size) != tuple(sit.grid_size):
+        raise ValueError(
+            f"feature grids are {geometry.grid_size}, but the {type(sit).__name__} has "
+            f"{tuple(sit.grid_size)} tokens; set --data.init_args.grid_size to the latter"
+        )
+    feature_dim = getattr(datamodule, "feature_dim", sit.feature_dim)
+    if feature_dim != sit.feature_dim:
+        raise ValueError(
+            f"features have width {feature_dim}, but the {type(sit).__name__} has "
+            f"feature_dim {sit.feature_dim}; set "
+            "--model.init_args.sit.init_args.feature_dim to the former"
+        )
+
+
 def planned_geometry(datamodule: object) -> ScanGeometry | None:
     """Geometry that the settings of a data module give before its setup.
 

@@ -52,7 +52,7 @@ class JointAlignment(GenerativeModule):
         """One step on range images ``(B, C, H, W)`` and feature grids ``(B, N, D)``."""
         image, features = batch["range_image"], batch.get("feature_grid")
         draws = self.draw_path(len(image))
-        posterior = self.vae.encode(image)
+        posterior = self.vae.encode(self.encoder_images(image, draws))
         latents = posterior.sample(draws.posterior_noise)
         prediction = self.vae.predict(self.decoder_latents(latents, draws))
 

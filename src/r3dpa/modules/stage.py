@@ -33,15 +33,16 @@ _PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")
 class PathDraws(NamedTuple):
     """Random numbers of one training step.
 
-    ``posterior_noise`` and ``noise`` are ``(B, C, h, w)`` standard normal, ``time`` is ``(B,)``,
-    and ``uniform`` ``(B,)`` in [0, 1) selects the noise on the latents of a decoder; empty in draws
-    for steps without.
+    ``posterior_noise`` and ``noise`` are ``(B, C, h, w)`` standard normal, ``time`` is ``(B,)``.
+    ``uniform`` ``(B,)`` in [0, 1) selects the noise on the latents of a decoder, ``further``
+    ``(B, 2)`` what an encoder sees: intensity, classes. Both are empty in draws without them.
     """
 
     posterior_noise: Tensor
     time: Tensor
     noise: Tensor
     uniform: Tensor = torch.empty(0)
+    further: Tensor = torch.empty(0, 2)
 
 
 class Stage(L.LightningModule, ABC):
@@ -189,6 +190,7 @@ class Stage(L.LightningModule, ABC):
             sample_time(total, self.time_sampling, generator=generator),
             torch.randn(shape, generator=generator, device=self.device),
             torch.rand(total, generator=generator, device=self.device),
+            torch.rand(total, 2, generator=generator, device=self.device),
         )
 
     # Losses
