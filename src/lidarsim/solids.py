@@ -123,40 +123,28 @@ def windows_of(
         time_s = actor_time_s.mean(axis=0)
         apart_s = np.abs(actor_time_s - time_s).max(axis=0)
 
-    def path_of(index: NDArray[np.int64], shot: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Where the sensor is (2, K) in shots, seen from solids that rest at their place."""
-        return middle[:, shot] - solids.velocity[index].T * time_s[shot]
-
     here = np.zeros((len(speed), 2))
     spread_m = np.hypot(*middle).max() + apart_m.max() + speed * (np.abs(time_s) + apart_s).max()
     wide = _windows_from(solids, fan, max_range_m, here, spread_m)
     if spread_m.max(initial=0.0) < 2 * apart_m.min():
         return wide
-    first = wide.shots[wide.order, 0] % num_shots
-    wide_shots = np.diff(wide.shots)[wide.order, 0]
-    last = first + wide_shots
-    # The path is straight: within a window it is farthest from its middle at one of the ends.
-    at_once = (last <= num_shots) & (wide_shots < num_shots)
-    index, first_shot, last_shot = wide.order[at_once], first[at_once], last[at_once]
-    here[index] = path_of(index, (first_shot + last_shot) // 2).T
-    ends = np.stack([path_of(index, first_shot), path_of(index, last_shot - 1)])
-    away_m = np.hypot(*np.moveaxis(ends - here[index].T, 1, 0)).max(axis=0)
-    shots = np.stack([first_shot, last_shot], axis=1)
-    spread_m[index] = away_m + _largest(apart_m, shots) + speed[index] * _largest(apart_s, shots)
-    # Where the turn ends and begins, the sensor jumps.
-    for place in np.flatnonzero(~at_once & (wide_shots < num_shots)):
-        index = wide.order[place]
-        inside = np.arange(first[place], last[place]) % num_shots
-        path = path_of(np.full(len(inside), index), inside)
-        here[index] = path[:, len(inside) // 2]
-        away_m = np.hypot(*(path - here[index][:, None]))
-        spread_m[index] = (away_m + apart_m[inside] + speed[index] * apart_s[inside]).max()
+    # Of the first windows that are no full turn, which may go on past the last shot.
+    index = wide.order[np.diff(wide.shots)[wide.order, 0] < num_shots]
+    first, last = wide.shots[index].T
+    shots = np.stack([first % num_shots, first % num_shots + last - first], axis=1)
+    path = np.stack([*middle, time_s])  # of the sensor: place and time
+    high, low = _largest(path, shots), -_largest(-path, shots)
+    (x, y, at_s), (far_x, far_y, far_s) = (high + low) / 2, (high - low) / 2
+    here[index] = np.stack([x, y], axis=1) - solids.velocity[index] * at_s[:, None]
+    spread_m[index] = np.hypot(far_x, far_y) + _largest(apart_m, shots)
+    spread_m[index] += speed[index] * (far_s + _largest(apart_s, shots))
     return _windows_from(solids, fan, max_range_m, here, spread_m)
 
 
-def _largest(values: NDArray, ranges: NDArray[np.int64]) -> NDArray:
-    """Largest value in each of the ranges (K, 2) of indices: first, one past the last."""
-    return np.maximum.reduceat(np.append(values, 0), ranges.reshape(-1))[::2]
+def _largest(values: NDArray, shots: NDArray[np.int64]) -> NDArray:
+    """Largest of values (..., W) in ranges (K, 2) of shots: first, one past the last, below 2 W."""
+    twice = np.concatenate([values, values, values[..., :1]], axis=-1)
+    return np.maximum.reduceat(twice, shots.reshape(-1), axis=-1)[..., ::2]
 
 
 def pieces(index: int, windows: Windows, num_shots: int) -> list[tuple[slice, slice]]:
