@@ -40,7 +40,7 @@ _MANIFEST = "simulation.json"
 _CLASSES = "classes.yaml"  # names of the class ids of the labels
 _START_AGAIN = "simulate the data set again into an empty folder"
 # Raised whenever the same request gives other scans than before.
-SIMULATOR_VERSION = 6
+SIMULATOR_VERSION = 7
 # Neighbouring scans share their blocks of street, so a worker takes a few in a row.
 _SCANS_PER_TASK = 8
 # Numbers of the scans of one drive, and their stride.

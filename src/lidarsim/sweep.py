@@ -118,6 +118,7 @@ class Sweep:
         self.cos_incidence: Floats = zeros  # cosine between ray and normal
         self.reflectivity: Floats = zeros.copy()
         self.material: NDArray[np.uint8] = zeros.astype(np.uint8)
+        self.extinction_per_m = 0.0  # of the air, as far as effects have attenuated the echoes
         self.min_power: Floats = zeros + np.float32(sensor.min_power)  # weakest detected, m^-2
 
     def grid(self, values: NDArray) -> NDArray:

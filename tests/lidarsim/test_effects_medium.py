@@ -8,7 +8,7 @@ from sweeps import box
 
 from lidarsim.draws import Draws
 from lidarsim.effects import DiffuseReflection, DualReturn, Fog, Rain, Snow, Spray
-from lidarsim.effects.medium import soft_waveform
+from lidarsim.effects.medium import attenuate, soft_waveform
 from lidarsim.scan import effect_name
 from lidarsim.scene import Conditions, Material, Scene, Semantic
 from lidarsim.sensors import Lasers, hdl64e
@@ -143,14 +143,15 @@ def strongest_drops(num_rays, target_m, reflectivity, intercept, slope, extincti
 
 
 @pytest.mark.parametrize(
-    ("effect", "weather", "intercept", "slope"),
+    ("effect", "weather", "intercept", "slope", "fog_per_m"),
     [
-        (Rain(), Conditions(rain_mm_h=20), 8000.0, 4.1 * 20**-0.21),
-        (Snow(), Conditions(snow_mm_h=1), 7600.0, 2.55),
+        (Rain(), Conditions(rain_mm_h=20), 8000.0, 4.1 * 20**-0.21, 0.0),
+        (Snow(), Conditions(snow_mm_h=1), 7600.0, 2.55, 0.0),
+        (Snow(), Conditions(snow_mm_h=1), 7600.0, 2.55, 0.05),
     ],
-    ids=["rain", "snow"],
+    ids=["rain", "snow", "snow in fog"],
 )
-def test_drops_against_drop_by_drop(effect, weather, intercept, slope):
+def test_drops_against_drop_by_drop(effect, weather, intercept, slope, fog_per_m):
     """Sky and rays at a target at 6 m, against a simulation of each drop in the beam."""
     rate = getattr(weather, effect.field)
     sensor = replace(SENSOR, shots=480)
@@ -158,9 +159,11 @@ def test_drops_against_drop_by_drop(effect, weather, intercept, slope):
         sweep = Sweep(Scene(weather=weather), sensor)
         sweep.first.range_m[:] = target_m
         sweep.first.power[:] = SENSOR.min_power
+        attenuate(sweep, fog_per_m)
         effect.apply(sweep, slice(None), Draws(sweep.num_rays, "drops"))
-        dark = SENSOR.min_power * math.exp(-2 * effect.extinction_per_m(rate) * target_m)
-        medium = effect.reflectivity, intercept, slope, effect.extinction_per_m(rate)
+        extinction = fog_per_m + effect.extinction_per_m(rate)
+        dark = SENSOR.min_power * math.exp(-2 * extinction * target_m)
+        medium = effect.reflectivity, intercept, slope, extinction
         power, range_m = strongest_drops(sweep.num_rays, target_m, *medium)
         weakest = SENSOR.min_power
         drops, expected = (sweep.first.origin > 0) & (sweep.first.power > weakest), power > weakest
@@ -182,7 +185,7 @@ def test_the_echo_of_a_drop_is_weakened_there_and_back():
     """
     line = replace(SENSOR, divergence_rad=1e-5, min_range_m=5.0)
     k = Rain().extinction_per_m(1e4)
-    edges, powers, _ = Rain().drop_table(1e4, line)
+    edges, powers, _ = Rain().drop_table(1e4, line, k)
     middle = 5.0 + (edges[1] - edges[0]) / 2
     assert powers[-1] == pytest.approx(0.02 * math.exp(-2 * k * middle) / middle**2, rel=1e-6)
     assert math.exp(-2 * k * middle) < 0.5
@@ -233,6 +236,21 @@ def test_a_plume_is_the_same_behind_a_car_whose_wheels_are_cast_and_one_far_away
     near, far = Scene((CAR, wheels), weather=wet), Scene((CAR,), weather=wet, unseen=(wheels,))
     sprayed = [Spray().rays(Sweep(scene, SENSOR)) for scene in (near, far)]
     np.testing.assert_array_equal(*sprayed)
+
+
+def test_fog_before_a_plume_weakens_its_echoes():
+    """A plume 5 to 14 m away: its echoes carry the extinction of fog up to its near side."""
+    scene = Scene((replace(CAR, centre=(16.0, 1.0, 0.85)),), weather=Conditions(water_film_mm=1.2))
+    foggy = replace(scene, weather=replace(scene.weather, visibility_m=200.0))
+    clear, fog = applied(Spray(), scene), applied(Fog(), foggy)
+    after = sweeps.swept(foggy, SENSOR, after=[DiffuseReflection(), Fog(), Spray()])
+    is_spray = (clear.first.origin == Origin.SPRAY) & (after.first.origin == Origin.SPRAY)
+    sprayed = np.flatnonzero(is_spray & (fog.first.origin == Origin.SURFACE))  # fog ends no plume
+    assert len(sprayed) > 10
+    ratio = after.first.power[sprayed] / clear.first.power[sprayed]
+    loss = 2 * math.log(20) / 200
+    assert (ratio < np.exp(-loss * 4.9)).all()
+    assert (ratio > np.exp(-loss * clear.first.range_m[sprayed] * 1.01)).all()
 
 
 def test_slow_vehicles_and_dry_roads_spray_nothing():

@@ -39,6 +39,7 @@ _DROP_STEP_M, _DROP_POWERS = 0.2, 64
 
 def attenuate(sweep: Sweep, extinction_per_m: float) -> None:
     """Attenuate every echo of the turn along its path, both ways."""
+    sweep.extinction_per_m += extinction_per_m
     # Above 0 in float32: 0 times an infinite range would be NaN.
     twice = np.float32(max(2 * extinction_per_m, 1e-30))
     for echoes in sweep.echoes():
@@ -134,7 +135,7 @@ class Spray(Effect):
     a soft echo as of fog (backscatter / extinction = 0.046 / ln 20) is added near its near side:
     at the depth s with the density exp(-2 extinction s), of the power::
 
-        backscatter * min(c tau / 2, L) * xi(r) / r^2
+        backscatter * min(c tau / 2, L) * xi(r) / r^2 * exp(-2 extinction of the air r)
 
     Source: 0.05 to 0.2 per metre in the plumes of cars at 60 to 90 km/h; the depth at which a road
     counts as flooded comes from wet-ground models.
@@ -181,6 +182,7 @@ class Spray(Effect):
             within_pulse = path.clip(max=sensor.pulse_depth_m)
             power = np.float32(_BACKSCATTER) * twice / 2 * within_pulse
             power *= overlap_by_square(enter, sensor)
+            power *= np.exp(-2 * sweep.extinction_per_m * enter)
             if twice:
                 depth = -np.log1p(drawn[chosen] * np.expm1(-twice * path)) / twice
                 sweep.offer(chosen, enter + depth, power, NO_SURFACE, Origin.SPRAY)
@@ -238,7 +240,8 @@ class _Hydrometeors(Effect):
 
         power = reflectivity * min(D / d, 1)^2 * exp(-2 extinction r) * xi(r) / r^2
 
-    so that those above a power p before the range r are a Poisson process with the mean::
+    with the extinction of all the air. So those above a power p before the range r are a Poisson
+    process with the mean::
 
         M(p, r) = integral of N0 / Lambda exp(-Lambda D_p(s)) pi (d / 2)^2 ds,   up to r
 
@@ -261,7 +264,7 @@ class _Hydrometeors(Effect):
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
         rate = getattr(sweep.scene.weather, self.field)
         attenuate(sweep, self.extinction_per_m(rate))
-        table = self.drop_table(rate, sweep.sensor)
+        table = self.drop_table(rate, sweep.sensor, sweep.extinction_per_m)
         if table is None:
             return
         edges, powers, expected = table
@@ -304,15 +307,15 @@ class _Hydrometeors(Effect):
         return 1e-6 * math.pi * self.intercept[0] / self.slope[0] ** 3 * rate_mm_h**exponent
 
     def drop_table(
-        self, rate_mm_h: float, sensor: SpinningLidar
+        self, rate_mm_h: float, sensor: SpinningLidar, extinction_per_m: float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float32]] | None:
         """Ranges ``(K,)``, powers ``(P,)`` and M ``(P, K)`` at them; None if no drop is detected.
 
-        The powers grow, even in their logarithms.
+        The powers grow, even in their logarithms. The extinction is that of all the air.
         """
         edges = range_edges(sensor, _DROP_STEP_M)
         middle = (edges[1:] + edges[:-1]) / 2
-        through = np.exp(-2 * self.extinction_per_m(rate_mm_h) * middle)
+        through = np.exp(-2 * extinction_per_m * middle)
         filling = self.reflectivity * through * overlap_by_square(middle, sensor)
         weakest = sensor.min_power * math.exp(-MAX_SPREADS * sensor.threshold_spread)
         if not (sensor.divergence_rad > 0 and filling.max() > weakest):
