@@ -13,6 +13,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from lidarsim.recorded import RecordedScan
 from lidarsim.ring_order import rings_in_order
+from lidarsim.sensors.beams import phase_of
 from lidarsim.sensors.view import LidarSensor, angles_of
 
 How = Literal["stored", "order", "inclination"]
@@ -90,7 +91,9 @@ def rings_of(scan: RecordedScan) -> Rings:
     step = np.diff(azimuth[order])[is_beside]
     step = step[step > 1e-5]
     num_shots = round(2 * math.pi / float(np.median(step))) if len(step) else 1
-    shot = np.floor(azimuth / (2 * np.pi) * num_shots).astype(np.int64) % num_shots
+    # Columns begin halfway between shots, so that rounding moves no shot to the next one.
+    offset, _ = phase_of(ring, azimuth, num_shots, len(mean))
+    shot = np.rint((azimuth - offset[ring]) / (2 * np.pi) * num_shots).astype(np.int64) % num_shots
     return Rings(ring, shot, len(mean), num_shots, how, sure)
 
 

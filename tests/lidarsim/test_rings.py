@@ -32,6 +32,15 @@ def test_rings_by_the_order_of_the_file_in_any_direction(model, beams):
         assert found.sure > 0.98
 
 
+@pytest.mark.parametrize("model", ["hdl32e", "os1_64", "vlp16"])
+def test_shots_at_multiples_of_the_step_are_told_apart(model):
+    """Rounding moves an azimuth to either side of a border that lies at the shots themselves."""
+    points, _ = simulated(model, 520)
+    found = rings_of(RecordedScan(points))
+    assert found.num_shots == 520
+    assert len(np.unique(found.ring * 520 + found.shot)) > 0.999 * len(points)
+
+
 @pytest.mark.parametrize("turn_deg", [40, 90, 200, 300])
 @pytest.mark.parametrize("way", [1, -1])
 def test_rings_may_start_at_any_azimuth(turn_deg, way):

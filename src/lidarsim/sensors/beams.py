@@ -150,7 +150,7 @@ def fit_columns(beam: Indices, azimuth: Floats, distance_m: Floats, scan: Indice
     straight = wrapped - lateral_m[beam] * inverse
     columns, coherence = _most_coherent(scan * num_beams + beam, straight, 2 * math.pi / column_rad)
     column_rad = 2 * math.pi / columns
-    offset, agreement = _phase(beam, straight, columns, num_beams)
+    offset, agreement = phase_of(beam, straight, columns, num_beams)
     offset[agreement < _COHERENT] = 0.0
 
     shots = (straight[after] - straight[before]) / column_rad
@@ -190,8 +190,8 @@ def _lateral(
     return lateral_m.clip(-_MOST_LATERAL_M, _MOST_LATERAL_M)
 
 
-def _phase(beam: Indices, azimuth: Floats, columns: int, num_beams: int) -> tuple[Floats, Floats]:
-    """Azimuth offset within a column and coherence of each beam, ``(H,)``."""
+def phase_of(beam: Indices, azimuth: Floats, columns: int, num_beams: int) -> tuple[Floats, Floats]:
+    """Azimuth offset within a column, in [0, column), and coherence of each beam, ``(H,)``."""
     turns = columns * azimuth
     counts = np.bincount(beam, minlength=num_beams).clip(1)
     real = np.bincount(beam, np.cos(turns), num_beams) / counts
@@ -212,7 +212,7 @@ def _most_coherent(group: Indices, azimuth: Floats, guess: float) -> tuple[int, 
     candidates = range(max(8, round(guess) - reach), round(guess) + reach + 1)
     num_groups = int(group.max()) + 1
     coherence = [
-        float(_phase(group, azimuth, columns, num_groups)[1].mean()) for columns in candidates
+        float(phase_of(group, azimuth, columns, num_groups)[1].mean()) for columns in candidates
     ]
     best = int(np.argmax(coherence))
     if coherence[best] < _COHERENT:
