@@ -50,6 +50,7 @@ class SimulatedScan:
         origins: ``(P,)`` uint8, the ``Origin`` of each point.
         effects: One record for each effect, in the order of ``EFFECTS``.
         scene: Solids, pose and motion of the sensor, weather.
+        sensor: What recorded it.
     """
 
     points: NDArray[np.float32]
@@ -57,6 +58,7 @@ class SimulatedScan:
     origins: NDArray[np.uint8]
     effects: tuple[EffectRecord, ...]
     scene: Scene
+    sensor: SpinningLidar
 
     def __repr__(self) -> str:
         ran = [effect.name for effect in self.effects if effect.status == "ran"]
@@ -103,7 +105,7 @@ def simulate_scan(
     records = [run_effect(effect, sweep, key, off) for effect in RAY_EFFECTS]
     sweep.cast()
     records += [run_effect(effect, sweep, key, off) for effect in ECHO_EFFECTS]
-    return SimulatedScan(*_points(sweep), tuple(records), scene)
+    return SimulatedScan(*_points(sweep), tuple(records), scene, sensor)
 
 
 class Simulator:

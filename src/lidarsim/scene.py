@@ -13,6 +13,7 @@ from numbers import Integral, Real
 from typing import Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 MAX_INSTANCE = 0xFFFF
 Interval = tuple[float, float]
@@ -187,6 +188,14 @@ class EgoMotion:
 
     def __post_init__(self) -> None:
         check_fields(self, "be finite", "speed_m_s", "yaw_rate_rad_s")
+
+    def moved(self, time_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Place ``(3,)`` and axes ``(3, 3)`` of the sensor at a time, in its frame at time 0."""
+        angle = self.yaw_rate_rad_s * time_s
+        cosine, sine = math.cos(angle), math.sin(angle)
+        chord = self.speed_m_s * time_s * np.sinc(angle / math.tau)
+        place = chord * np.array([math.cos(angle / 2), math.sin(angle / 2), 0.0])
+        return place, np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True)
