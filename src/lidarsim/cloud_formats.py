@@ -30,6 +30,8 @@ _ADVICE = (
 )
 # Share of the points whose intensity may be odd: single returns exceed the full scale of a sensor.
 ODD_SHARE = 1 / 1000
+# Intensities of which fewer exceed 1 are no bytes.
+_FEWEST_ABOVE_ONE = 1 / 20
 _MOST_BEAMS, _MOST_COLUMNS = 256, 4096
 _MOST_RATIO = 100  # size of data over size of its file; LZF reaches 88
 _OTHER_WIDTHS = (5, 6, 7, 8, 10, 12)
@@ -89,6 +91,20 @@ def _refuse_devices(path: Path) -> None:
         raise ScanError(f"{path}: is a folder; give one scan")
     if path.exists() and not path.is_file():
         raise ScanError(f"{path}: is no regular file")
+
+
+def refuse_two_scales(intensity: NDArray, where: str | Path) -> None:
+    """Refuse floats of which most are shares of 1, but too many to be odd values are not.
+
+    Such are raw intensities that have no largest value, as Waymo's; read as bytes they would be
+    255 times too dark.
+    """
+    share = np.count_nonzero(intensity > 1) / max(len(intensity), 1)
+    if intensity.dtype.kind == "f" and ODD_SHARE < share < _FEWEST_ABOVE_ONE:
+        raise ScanError(
+            f"{where}: {share:.1%} of the intensities exceed 1, up to {intensity.max():g}, and all "
+            "others do not: give their full scale as full_intensity"
+        )
 
 
 def table_of(columns: Mapping[str, NDArray], num_points: int) -> Table:

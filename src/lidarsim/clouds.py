@@ -38,6 +38,7 @@ from lidarsim.cloud_formats import (
     Table,
     ply_of,
     read_bytes,
+    refuse_two_scales,
     table_of,
 )
 from lidarsim.io import UNPICKLING_ERRORS, first_line, write_bytes
@@ -146,7 +147,7 @@ class PointCloud:
         of LAS files.
 
         Raises:
-            ScanError: If intensities exceed 255 and no ``full_scale`` is given.
+            ScanError: If intensities exceed 255, or few of them 1, and no ``full_scale`` is given.
         """
         values = self.intensity
         if values is None:
@@ -164,6 +165,7 @@ class PointCloud:
         num_above = np.count_nonzero(intensity > 1)
         if intensity.dtype.kind == "f" and num_above <= ODD_SHARE * len(self):
             return 1.0
+        refuse_two_scales(intensity, self.where)
         largest = intensity.max(initial=0)
         if largest <= 255:
             return 255.0

@@ -14,6 +14,7 @@ import statistics
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from numbers import Integral
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -31,6 +32,7 @@ from lidarsim.scan import Simulator, check_switches
 from lidarsim.scene import Conditions, Semantic
 from lidarsim.sensors.files import load_sensor
 from lidarsim.sensors.spinning import SpinningLidar
+from lidarsim.street.streets import LAST_SCAN
 
 TRAIN_DRIVES = ("0003", "0004", "0005", "0006", "0007", "0009", "0010")
 VAL_DRIVES = ("0000", "0002")
@@ -135,14 +137,19 @@ def simulate(
         ChildProcessError: If a worker was killed.
     """
     for name, value in (("workers", workers), ("every", every)):
-        if value < 1:
-            raise ValueError(f"{name} must be 1 or greater, got {value}")
-    if isinstance(sensor, str):
+        if not (isinstance(value, Integral) and value >= 1):
+            raise ValueError(f"{name} must be a whole number, 1 or greater, got {value}")
+    if not isinstance(sensor, SpinningLidar):
         sensor = load_sensor(sensor)
     if return_mode is not None:
         sensor = replace(sensor, return_mode=return_mode)
     names = (*TRAIN_DRIVES, *VAL_DRIVES) if drives is None else tuple(drives)
     counts = split_scans(scans, names)
+    if (last := (max(counts.values()) - 1) * every) > LAST_SCAN:
+        raise ValueError(
+            f"every {every} leads to scan {last} of a drive, which has {LAST_SCAN}: give a smaller "
+            "stride or more drives"
+        )
     simulators = {drive: Simulator(seed, int(drive), weather, sensor, effects) for drive in counts}
     request = {
         "simulator_version": SIMULATOR_VERSION,

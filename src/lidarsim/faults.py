@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from numbers import Integral
 from typing import Any, Literal
 
 import numpy as np
@@ -78,7 +79,7 @@ class Fault:
         if self.kind not in STRENGTHS:
             raise ValueError(f"unknown fault {self.kind!r}; choose from {', '.join(STRENGTHS)}")
         _, most, unit = STRENGTHS[self.kind]
-        if self.severity not in range(4):
+        if not isinstance(self.severity, Integral) or self.severity not in range(4):
             raise ValueError(f"severity must be 0, 1, 2 or 3, got {self.severity}")
         if not 0 <= self.amount <= most:
             raise ValueError(f"strength must lie in 0..{most} ({unit}), got {self.strength}")

@@ -309,6 +309,8 @@ def realism_table(
         floors = _distances_of_pairs(measure, real_pairs)
         distance = _over_finite(np.median, distances)
         floor = _over_finite(np.median, floors)
+        if measure.unit == "rows":  # whole ones, of which scans may have equally many by chance
+            floor = max(floor, 1.0)
         real = whole_b[name]
         ratio = math.nan
         lacks = {"A": measure.lacks, "B": real.lacks}

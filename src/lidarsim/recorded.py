@@ -9,12 +9,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from lidarsim.cloud_formats import refuse_two_scales
 from lidarsim.draws import Draws
 from lidarsim.ground import ground_of
 from lidarsim.scan import damped_intensity, power_of_intensity
@@ -113,8 +115,9 @@ class Instrument:
     """Assumed properties of the instrument that recorded a scan.
 
     Args:
-        sensor: Its detection limit, beam, pulse and noise: a preset such as ``hdl32e``, a
-            calibration file or a :class:`SpinningLidar`; its lasers are not used.
+        sensor: Its detection limit, beam, pulse and noise, and the mean height of its lasers, from
+            which added points are seen: a preset such as ``hdl32e``, a calibration file or a
+            :class:`SpinningLidar`.
         returns: Which echoes of a shot it reports.
         full_intensity: Intensity of a white surface in front of it. Default: from the 99.9 %
             quantile q of each scan: 1 if q <= 1 (not for integers), 255 if q <= 255, else q.
@@ -123,7 +126,7 @@ class Instrument:
             range, as in calibrated reflectivities.
     """
 
-    sensor: str | SpinningLidar = "hdl64e"
+    sensor: str | Path | SpinningLidar = "hdl64e"
     returns: Returns = "strongest"
     full_intensity: float | None = None
     response: Literal["root", "linear"] = "root"
@@ -146,9 +149,9 @@ class Instrument:
 
 @lru_cache
 def _with_laser(
-    sensor: str | SpinningLidar, returns: Returns, inclination_deg: int
+    sensor: str | Path | SpinningLidar, returns: Returns, inclination_deg: int
 ) -> SpinningLidar:
-    sensor = load_sensor(sensor) if isinstance(sensor, str) else sensor
+    sensor = sensor if isinstance(sensor, SpinningLidar) else load_sensor(sensor)
     highest = min(inclination_deg, _HIGHEST_DEG)
     height_m = float(np.mean(sensor.lasers.height_m))
     laser = Lasers((np.radians(highest),), (0.0,), (height_m,), (0.0,), (0.0,), (1.0,))
@@ -170,7 +173,7 @@ def scale_of(intensity: NDArray | None, full: float | None = None) -> IntensityS
     1 up to 1, 255 up to 255, else the quantile itself. Integers are never shares of 1.
 
     Raises:
-        ValueError: If some are negative.
+        ValueError: If some are negative, or few of them exceed 1 and ``full`` is not given.
     """
     values = np.zeros(1) if intensity is None else intensity.astype(float)
     low, high = values.min(), values.max()
@@ -180,6 +183,8 @@ def scale_of(intensity: NDArray | None, full: float | None = None) -> IntensityS
         missing = "no intensity" if intensity is None else f"intensity is {low:g} throughout"
         text = f"{missing}: a white share of {_UNKNOWN_INTENSITY:g} is assumed of every point"
         return IntensityScale(float(low), 0.0, False, text)
+    if intensity is not None and full is None:
+        refuse_two_scales(intensity, "the scan")
     is_integer = intensity is not None and intensity.dtype.kind in "iu"
     largest = high if high <= 1 else float(np.quantile(values, 0.999))
     if largest <= 1 and not is_integer:
@@ -311,8 +316,18 @@ class RecordedSweep(Sweep):
         return np.round(values / step) * step if step else values
 
     def rays_near(self, solids: Solids) -> list[NDArray[np.int64]]:
-        """All rays for each solid."""
-        return [np.arange(self.num_rays)] * len(solids.shape)
+        """Rays for each solid that meet the sphere around it, where it is during the turn."""
+        away = solids.centre - self.start[:, :1].T
+        distance = np.linalg.norm(away, axis=1)
+        moved = np.linalg.norm(solids.velocity, axis=1) * np.abs(self.time_s).max(initial=0)
+        radius = np.linalg.norm(solids.half_size, axis=1) + moved
+        sine = np.minimum(radius / np.maximum(distance, 1e-6), 1)
+        least = np.where(radius < distance, np.sqrt(1 - sine**2) - 1e-6, -np.inf)
+        ahead = away / np.maximum(distance, 1e-6)[:, None]
+        return [
+            np.flatnonzero(one @ self.direction > cosine)
+            for one, cosine in zip(ahead, least, strict=True)
+        ]
 
     def on_ground(self) -> NDArray[np.int64]:
         """Rays that hit the plane of the ground in their sector."""

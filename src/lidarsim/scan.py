@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -137,14 +138,14 @@ class Simulator:
         seed: int = 0,
         drive: int = 0,
         weather: Conditions | None = None,
-        sensor: str | SpinningLidar = "hdl64e",
+        sensor: str | Path | SpinningLidar = "hdl64e",
         effects: Mapping[str, str | bool] | None = None,
     ) -> None:
         if isinstance(weather, Mapping):
             arguments = ", ".join(f"{name}={value}" for name, value in weather.items())
             raise ValueError(f"weather must be an object such as Weather({arguments}), got a dict")
         self.street = Street(seed, drive, weather)
-        self.sensor = load_sensor(sensor) if isinstance(sensor, str) else sensor
+        self.sensor = sensor if isinstance(sensor, SpinningLidar) else load_sensor(sensor)
         self.switches = check_switches(effects or {})
 
     def __repr__(self) -> str:

@@ -73,7 +73,7 @@ class ScanStatistics:
     # Of all scans
     num_returns: float = 0.0
     low_points: float = 0.0  # returns below z = -1.4 m
-    points_per_scan: Floats = _table(Bins(100, 2001))  # scans by number of returns
+    points_per_scan: Floats = _table(Bins(100, 6001))  # scans by number of returns
     valid_share: Floats = _table(Bins(0.001, 1001))  # scans by valid share of the 64 x 1024 image
     row_returns: Floats = _table(BEAMS)  # valid pixels (1 to 56 m) by image row
     range_counts: Floats = _table(2, Bins(1.0, 80))  # by block of lasers, above and below -8.67 deg
@@ -143,7 +143,7 @@ def scan_statistics(points: NDArray[np.float32]) -> ScanStatistics:
             f"intensity must lie in [0, 1], got {intensity.min():g} to {intensity.max():g}; "
             "divide by the largest value that the sensor can give"
         )
-    intensity = intensity.clip(0, 1)
+    intensity = np.nan_to_num(intensity).clip(0, 1)
     s = ScanStatistics(num_scans=1, num_returns=float(len(xyz)))
     s.low_points = float((xyz[:, 2] < _LOW_Z_M).sum())
     valid_mask = hit_pixels(points[:, :3], SENSOR)

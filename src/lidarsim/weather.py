@@ -142,7 +142,7 @@ class Weather(scene.Conditions):
         self,
         scan: Any,
         seed: Seed = 0,
-        instrument: Instrument = _INSTRUMENT,
+        instrument: Instrument | None = None,
         boxes: NDArray[np.floating] | None = None,
         effects: Mapping[str, str | bool] | None = None,
     ) -> Any:
@@ -153,7 +153,8 @@ class Weather(scene.Conditions):
                 :class:`PointCloud`; a :class:`RecordedScan`, a :class:`SimulatedScan`, or the path
                 of a scan.
             seed: Of the random draws; the draws of each effect do not depend on other effects.
-            instrument: What is assumed of the instrument.
+            instrument: What is assumed of the instrument. Default: that of a simulated scan, else
+                ``Instrument()``.
             boxes: ``(N, 8)`` vehicles that throw spray: centre x, y, z, length, width, height in
                 metres, heading in radians, speed in m/s.
             effects: ``off`` omits an effect; ``blooming`` and ``range_noise``, which a recorded
@@ -167,9 +168,9 @@ class Weather(scene.Conditions):
             ValueError: If an effect is unknown or cannot act on a recorded scan, or boxes or
                 intensities cannot be used.
         """
-        return change_scan(
-            scan, lambda recorded: self._apply(recorded, seed, instrument, boxes, effects)
-        )
+        known = Instrument(scan.sensor) if isinstance(scan, SimulatedScan) else _INSTRUMENT
+        used = instrument or known
+        return change_scan(scan, lambda recorded: self._apply(recorded, seed, used, boxes, effects))
 
     def _apply(
         self,

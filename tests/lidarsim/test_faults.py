@@ -146,6 +146,8 @@ def test_what_is_missing_or_out_of_range_is_named():
         Fault("fog")
     with pytest.raises(ValueError, match="severity must be 0, 1, 2 or 3, got 4"):
         Fault("crosstalk", 4)
+    with pytest.raises(ValueError, match=r"severity must be 0, 1, 2 or 3, got 1\.0"):
+        Fault("crosstalk", 1.0)
     with pytest.raises(ValueError, match=r"strength must lie in 0\.\.1 \(of the points\), got 1.5"):
         Fault("crosstalk", strength=1.5)
     with pytest.raises(ValueError, match="strength must lie in"):

@@ -1,3 +1,4 @@
+import copy
 import json
 import math
 import re
@@ -132,3 +133,27 @@ def test_measures_that_scans_cannot_give_are_named(drives):
 def test_no_drive_is_refused(drives):
     with pytest.raises(ValueError, match="at least one drive"):
         realism_table({}, drives)
+
+
+def test_a_row_of_pixels_more_or_less_is_no_difference(drives):
+    """Drives with equally many rows have no spread; any other number would be infinitely far."""
+    reference = {name: drives[name] for name in ("drive 0", "drive 1")}
+    other = copy.deepcopy(drives["drive 2"])
+    hit = np.flatnonzero(other.row_returns)
+    other.row_returns[hit[-1]] = 0
+    rows = {row.name: row for row in realism_table({"a": other}, reference).rows}
+    row = rows["image rows > 2 % valid"]
+    assert (row.distance, row.floor, row.ratio) == (1, 1, 1)
+
+
+def test_a_scan_of_many_returns_differs_from_one_of_more():
+    points = np.random.default_rng(0).normal(0, 15, (520_000, 3)).astype(np.float32)
+    sets = [np.column_stack([p, np.ones(len(p), np.float32)]) for p in (points[:260_000], points)]
+    few, many = (scan_statistics(each).points_per_scan.argmax() for each in sets)
+    assert many > 1.9 * few
+
+
+def test_single_intensities_that_are_no_numbers_do_not_matter():
+    points = street(0)
+    points[7, 3] = np.nan
+    assert scan_statistics(points).num_intensity_scans == 1

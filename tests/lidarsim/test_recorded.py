@@ -5,11 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lidarsim import Semantic, Street, load_sensor, simulate_scan
+from lidarsim import Semantic, Simulator, Street, load_sensor, simulate_scan
 from lidarsim.draws import Draws
 from lidarsim.ground import ground_of
+from lidarsim.raycast import surface_distance
 from lidarsim.recorded import Instrument, RecordedScan, RecordedSweep
-from lidarsim.scene import Conditions, Primitive, Scene, Shape
+from lidarsim.scene import Conditions, Pose, Primitive, Scene, Shape
+from lidarsim.sensors.files import read_sensor, write_sensor
+from lidarsim.solids import solids_of
 
 
 def test_the_ground_is_found():
@@ -56,3 +59,34 @@ def test_a_moving_box_is_shown_where_its_shots_were_taken():
     sensor = replace(instrument.sensor_for(ring), spin_hz=10.0)
     sweep = RecordedSweep(Scene((box,)), ring, instrument, sensor, Draws(400, 0))
     assert sweep.scene.primitives[0].centre == pytest.approx((-0.2, 10.1, 0.0), abs=1e-3)
+
+
+def test_rays_near_a_solid_are_those_that_can_meet_it():
+    generator = np.random.default_rng(0)
+    points = generator.normal(0, 15, (20_000, 3)).astype(np.float32)
+    scan, instrument = RecordedScan(points), Instrument()
+    sensor = instrument.sensor_for(scan)
+    sweep = RecordedSweep(Scene(), scan, instrument, sensor, Draws(len(points), 0))
+    car = Primitive(Shape.BOX, (0, 0, 0), (2, 1, 1), Semantic.CAR, 0.5, velocity_m_s=(9, 0))
+    ahead = replace(car, centre=(12, 5, 0), yaw_rad=0.4)
+    behind = replace(car, centre=(-30, 2, 1), yaw_rad=2.0)
+    solids = solids_of([ahead, behind, car], Pose(z_m=0.0), 0.0)
+    near = sweep.rays_near(solids)
+    for index, rays in enumerate(near):
+        start = sweep.start.copy()
+        start[:2] -= solids.velocity[index][:, None] * sweep.time_s
+        every = np.full(sweep.num_rays, index)
+        enter, leave = surface_distance(solids, every, start, sweep.direction)
+        met = np.flatnonzero(leave > np.maximum(enter, 0))
+        assert np.isin(met, rays).all()
+    assert [len(rays) < 1000 for rays in near] == [True, True, False]
+
+
+@pytest.mark.parametrize("kind", ["preset", "path", "sensor"])
+def test_the_instrument_takes_all_that_a_simulator_takes(tmp_path, kind):
+    path = tmp_path / "mine.yaml"
+    write_sensor(path, read_sensor("vlp16"))
+    sensor = {"preset": "vlp16", "path": path, "sensor": load_sensor("vlp16")}[kind]
+    scan = RecordedScan(np.ones((5, 3), np.float32))
+    assert Instrument(sensor).sensor_for(scan).divergence_rad == load_sensor("vlp16").divergence_rad
+    assert Simulator(sensor=sensor).sensor.num_beams == 16

@@ -354,7 +354,12 @@ def test_split_of_chosen_drives():
     ("wrong", "message"),
     [
         ({"scans": 0}, "scans must be 1 or greater, got 0"),
-        ({"workers": 0}, "workers must be 1 or greater, got 0"),
+        ({"workers": 0}, "workers must be a whole number, 1 or greater, got 0"),
+        ({"every": 1.5}, "every must be a whole number, 1 or greater, got 1.5"),
+        (
+            {"scans": 7, "every": 200_000, "drives": ["0003"]},
+            "every 200000 leads to scan 1200000 of a drive, which has 1000000",
+        ),
         ({"seed": -1}, "seed must be a whole number, 0 or greater, got -1"),
         ({"sensor": "lidar"}, "unknown sensor 'lidar'"),
         ({"drives": ["3"]}, "got 3"),

@@ -253,6 +253,16 @@ def test_spray_hangs_behind_a_given_box_alone(scan):
     assert np.isin(np.intersect1d(dry.index, np.flatnonzero(behind)), result.index).all()
 
 
+def test_added_points_of_a_simulated_scan_lie_on_the_beams_of_its_sensor():
+    scan = Simulator(sensor="vlp16").scan(3)
+    result = Weather(visibility_m=40).apply(scan)
+    new = result.index < 0
+    assert new.sum() > 100
+    seen, shot = result.points[new], scan.points[result.shot[new], :3]
+    inclination = [np.arctan2(p[:, 2], np.hypot(p[:, 0], p[:, 1])) for p in (seen, shot)]
+    np.testing.assert_allclose(*inclination, atol=1e-5)
+
+
 @pytest.mark.parametrize("name", REFUSED)
 def test_effects_that_need_a_scene_are_refused_by_name(scan, name):
     with pytest.raises(ValueError, match=f"effect {name} cannot act on a recorded scan: "):
@@ -282,6 +292,12 @@ def test_effects_that_need_a_scene_are_refused_by_name(scan, name):
         ),
         (lambda s: Weather(visibility_m=60).apply(s, seed=0.5), "seed must be .*, got 0.5"),
         (lambda s: Weather(visibility_m=60).apply(s, seed=-1), "seed must be .*, got -1"),
+        (
+            lambda s: Weather(visibility_m=60).apply(
+                replace(s, intensity=s.intensity + (np.arange(len(s)) % 100 == 0))
+            ),
+            r"the scan: 0\.9% of the intensities exceed 1, up to .*: give their full scale",
+        ),
         (lambda s: Weather().apply(s, boxes=np.zeros(3)), r"boxes must be \(N, 8\)"),
     ],
 )
@@ -478,6 +494,6 @@ def test_a_simulated_scan_is_changed_as_a_recorded_one():
     found = Weather(visibility_m=60).apply(scan)
     points, intensity = scan.points[:, :3], scan.points[:, 3]
     recorded = RecordedScan(points, intensity, labels=scan.labels)
-    expected = Weather(visibility_m=60).apply(recorded)
+    expected = Weather(visibility_m=60).apply(recorded, instrument=Instrument("vlp16"))
     np.testing.assert_array_equal(found.points, expected.points)
     np.testing.assert_array_equal(found.labels, expected.labels)

@@ -245,7 +245,7 @@ def search_beams(beam: Indices, distance_m: Floats, z_m: Floats) -> Indices | No
         peaks, _ = find_peaks(density, prominence=_PEAK * density.max())
         middle = seen.min() + (peaks - 4.5) * bin_rad
         if len(middle):
-            nearest = np.abs(seen[:, None] - middle).argmin(axis=1)
+            nearest = np.searchsorted((middle[1:] + middle[:-1]) / 2, seen)
             is_close = np.abs(seen - middle[nearest]) < near
             beam[rest[is_close]] = len(inclination) + nearest[is_close]
         beam = np.unique(beam, return_inverse=True)[1]

@@ -60,7 +60,8 @@ class SensorEstimate:
     """A sensor as scans show it.
 
     Args:
-        sensor: Its beams, columns, range limits and height; the rest is as for the HDL-64E.
+        sensor: Its beams, columns, range limits and height; the rest are the defaults of
+            :class:`SpinningLidar`.
         num_scans: Number of scans that were combined.
         beams_by: ``a stored ring``, ``the order`` or ``the inclination``, see
             :func:`lidarsim.rings.rings_of`.

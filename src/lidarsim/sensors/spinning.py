@@ -93,6 +93,7 @@ class SpinningLidar:
 
     def __post_init__(self) -> None:
         check_fields(self, "be a whole number, 0 or greater", "shots")
+        object.__setattr__(self, "shots", int(self.shots))  # JSON has no integers of NumPy
         if self.shots < 8:
             raise ValueError(f"shots must be at least 8 per turn, got {self.shots}")
         check_fields(

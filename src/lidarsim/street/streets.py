@@ -41,7 +41,8 @@ _SIDE_STREET_M = (5.6, 8.4)
 # Weather lasts this many scans.
 _SCANS_PER_WEATHER = 100
 # A day of driving; the course of a drive is followed from its start.
-_LAST_SCAN = 1_000_000
+#: Largest number of a scan in a drive.
+LAST_SCAN = 1_000_000
 # Instance numbers of blocks repeat after 200 blocks = 4.8 km, of actors of one kind in one lane
 # after 1000.
 _MAX_OBJECTS_PER_BLOCK = 256
@@ -59,9 +60,9 @@ class Street:
     The axis bends gently and rises and falls; ``s`` runs along it, the lateral coordinate points
     to the left. Road, plots with houses and gardens, and the kerbside with parked cars, trees and
     street furniture stand still in blocks of 24 m. Vehicles, cyclists and people move in lanes. The
-    recording car advances 1.0 to 1.4 m per scan or stands for a while. By its number a drive leads
-    through a dense town, a suburb, a green edge of town, along an arterial road, past row houses,
-    or through fields, see ``course.CHARACTERS``.
+    recording car advances 1.0 to 1.4 m per scan or stands for a while. By its number and
+    the seed a drive leads through a dense town, a suburb, a green edge of town, along an arterial
+    road, past row houses, or through fields, see ``course.CHARACTERS``.
 
     Args:
         seed: Seed of the data set, 0 or greater.
@@ -120,8 +121,8 @@ class Street:
 
     def weather_of(self, scan: int) -> Conditions:
         """The weather of one scan."""
-        if not (isinstance(scan, Integral) and 0 <= scan <= _LAST_SCAN):
-            raise ValueError(f"scan must be a whole number in 0..{_LAST_SCAN}, got {scan}")
+        if not (isinstance(scan, Integral) and 0 <= scan <= LAST_SCAN):
+            raise ValueError(f"scan must be a whole number in 0..{LAST_SCAN}, got {scan}")
         if self.weather is not None:
             return self.weather
         stretch = scan // _SCANS_PER_WEATHER
