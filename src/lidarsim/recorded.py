@@ -325,8 +325,8 @@ class RecordedSweep(Sweep):
         least = np.where(radius < distance, np.sqrt(1 - sine**2) - 1e-6, -np.inf)
         ahead = away / np.maximum(distance, 1e-6)[:, None]
         return [
-            np.flatnonzero(one @ self.direction > cosine)
-            for one, cosine in zip(ahead, least, strict=True)
+            np.flatnonzero(axis @ self.direction > cosine)
+            for axis, cosine in zip(ahead, least, strict=True)
         ]
 
     def on_ground(self) -> NDArray[np.int64]:

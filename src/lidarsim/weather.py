@@ -153,8 +153,8 @@ class Weather(scene.Conditions):
                 :class:`PointCloud`; a :class:`RecordedScan`, a :class:`SimulatedScan`, or the path
                 of a scan.
             seed: Of the random draws; the draws of each effect do not depend on other effects.
-            instrument: What is assumed of the instrument. Default: that of a simulated scan, else
-                ``Instrument()``.
+            instrument: What is assumed of the instrument. Default: the sensor of a simulated
+                scan, else ``Instrument()``.
             boxes: ``(N, 8)`` vehicles that throw spray: centre x, y, z, length, width, height in
                 metres, heading in radians, speed in m/s.
             effects: ``off`` omits an effect; ``blooming`` and ``range_noise``, which a recorded

@@ -346,8 +346,8 @@ class GenerativeModule(Stage):
     def encoder_images(self, image: Tensor, draws: PathDraws) -> Tensor:
         """Range images ``(B, C, H, W)`` as the encoder sees them in training.
 
-        With ``further_dropout`` some have no intensity and some no classes, as those of scans that
-        were recorded without. The decoder learns both from all.
+        With ``further_dropout`` some have no intensity and some no classes, as scans that were
+        recorded without. The decoder learns both from all.
         """
         if self.further_dropout == 0:
             return image
