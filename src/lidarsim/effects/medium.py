@@ -311,7 +311,7 @@ class _Hydrometeors(Effect):
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float32]] | None:
         """Ranges ``(K,)``, powers ``(P,)`` and M ``(P, K)`` at them; None if no drop is detected.
 
-        The powers grow, even in their logarithms. ``extinction_per_m`` is of fog, rain and snow together.
+        The powers grow, even in their logarithms. The extinction is of fog, rain and snow together.
         """
         edges = range_edges(sensor, _DROP_STEP_M)
         middle = (edges[1:] + edges[:-1]) / 2
