@@ -55,6 +55,7 @@ R3DPA_S = {  # in the order given
 }
 R3DPA_S_2 = {
     "vae": ("vae_alignment",),
+    "encoder": ("vae_alignment", "encoder"),
     "vae_rgb": ("teacher", "vae_alignment", "vae_rgb"),
     "decoder": ("vae_alignment", "vae_decoder"),
     "decoder_labels": ("vae_alignment", "decoder_labels"),
