@@ -16,6 +16,7 @@ from r3dpa.geometry import (
 
 SENSOR = LidarSensor(beams=4, columns=32)
 FAR = LidarSensor(beams=4, columns=32, range_max_m=80.0)
+NEAR = LidarSensor(beams=4, columns=32, range_min_m=1.45, range_max_m=80.0)
 
 
 RINGS = RingProjection(SENSOR, (2.0, -1.0, -8.5, -20.0))
@@ -71,9 +72,16 @@ def test_damaged_values_of_a_geometry_are_refused():
         (FAR, RangeCodec(), RangeCodec("linear", 80.0), "ends at 56.00 m, but .* up to 80 m"),
         (FAR, RangeCodec("log2"), RangeCodec("log2", math.log2(81)), "ends at 56.28 m"),
         (SENSOR, RangeCodec("linear", 55.9), RangeCodec(), "ends at 55.90 m"),
+        (
+            SENSOR,
+            RangeCodec("inverse"),
+            RangeCodec("inverse", 1.0),
+            "begins .* 1.45 m, .* from 1 m",
+        ),
+        (NEAR, RangeCodec("inverse", 1.5), RangeCodec("inverse"), "Lower the scale"),
     ],
 )
-def test_a_codec_that_would_show_far_points_as_a_wall_is_refused(sensor, short, enough, message):
+def test_a_codec_that_would_show_other_points_as_a_wall_is_refused(sensor, short, enough, message):
     ScanGeometry(SphericalProjection(sensor), enough, (2, 8))
     with pytest.raises(ValueError, match=message):
         ScanGeometry(SphericalProjection(sensor), short, (2, 8))

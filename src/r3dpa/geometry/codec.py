@@ -312,10 +312,17 @@ class ScanGeometry:
     def __post_init__(self) -> None:
         sensor = self.projection.sensor
         sensor.cell_size(self.grid_size)
-        farthest_m = self.codec.to_range(torch.ones(())).item()
-        if farthest_m < sensor.range_max_m - _ROUNDING_M:
+        limit_m = self.codec.to_range(torch.ones(())).item()
+        if self.codec.encoding == "inverse":
+            if limit_m > sensor.range_min_m + _ROUNDING_M:
+                raise ValueError(
+                    f"the inverse encoding begins at its scale of {limit_m:.2f} m, but the sensor "
+                    f"reports from {sensor.range_min_m:g} m: nearer points would become a wall. "
+                    "Lower the scale of the codec to range_min_m or raise range_min_m"
+                )
+        elif limit_m < sensor.range_max_m - _ROUNDING_M:
             raise ValueError(
-                f"the range encoding ends at {farthest_m:.2f} m, but the sensor reports up to "
+                f"the range encoding ends at {limit_m:.2f} m, but the sensor reports up to "
                 f"{sensor.range_max_m:g} m: farther points would become a wall. Raise the scale of "
                 f"the codec (linear: range_max_m, log2: log2(range_max_m + 1)) or lower range_max_m"
             )
