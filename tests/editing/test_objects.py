@@ -8,6 +8,9 @@ from safetensors.torch import save_file
 
 from lidarsim import Semantic
 from lidarsim.clouds import read_cloud
+from lidarsim.conversion import convert
+from lidarsim.sweep import Origin
+from lidarsim.weather import ADDED_CLASS
 from r3dpa.data import Scan, ScanError, write_bin
 from r3dpa.data.labels import (
     CLASS_NAMES,
@@ -79,6 +82,23 @@ def test_classes_go_back_to_the_ids_of_their_file(tmp_path):
     assert classes_as_of_cloud(np.array([0, 38, car]), cloud).tolist() == [0, 0, 10]  # 38: a lamp
     seen = scan_pixels(scan, PROJECTION).classes.unique().tolist()
     assert {SEMANTIC_CLASSES[n].name for n in seen if n >= 0} == {"car", "road", "building"}
+
+
+def test_labels_of_semantic_kitti_keep_their_meaning_in_another_format_and_in_weather(tmp_path):
+    scan, rain = tmp_path / "velodyne" / "000001.bin", ADDED_CLASS + Origin.RAIN
+    write_bin(scan, np.ones((18, 4)))
+    (tmp_path / "labels").mkdir()
+    ids = np.array([10, 48, rain] * 6, "<u4")
+    (tmp_path / "labels" / "000001.label").write_bytes(ids.tobytes())
+    convert(scan, tmp_path / "ply" / "1.ply")
+    for path in (scan, tmp_path / "ply" / "1.ply"):
+        cloud = read_cloud(path)
+        assert labels_of_cloud(cloud).tolist() == [26, 8, rain] * 6  # a car, a sidewalk
+        assert classes_as_of_cloud(np.array([26, 8]), cloud).tolist() == [10, 48]
+    # 45 and 46 are ids of neither, 12 one of KITTI-360 alone.
+    for ids in ([7, 8, rain], [10, 45, 46], [10, 48, 12]):
+        (tmp_path / "ply" / "1.label").write_bytes(np.array(ids, "<u4").tobytes())
+        assert find_labels(tmp_path / "ply" / "1.ply", 3).tolist() == ids
 
 
 @pytest.mark.parametrize("place", ["", "labels", "../labels"])

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from lidarsim.cloud_formats import ScanError
 from lidarsim.clouds import PointCloud, labels_beside
+from lidarsim.weather import ADDED_CLASS
 from r3dpa.io import atomic_path
 
 #: Names by KITTI-360 class id; every other id counts as unlabelled.
@@ -85,14 +86,17 @@ _ID_OF = {name: number for number, name in CLASS_NAMES.items()}
 _SEMANTIC_KITTI = {0: 0, 1: 0} | {
     number: _ID_OF[name] for name, numbers in _SEMANTIC_KITTI_IDS.items() for number in numbers
 }
+_LAST_OF_KITTI_360 = max(CLASS_NAMES)
 
 
 def read_labels(scan: str | Path, num_points: int) -> NDArray[np.int64]:
     """Class and object of each of the P points of a scan, from the ``.label`` file beside it.
 
     The file lies in the folder of the scan, in ``labels`` there, or in ``labels`` beside the
-    folder, as `r3dpa data simulate` and `r3dpa sample` write it. Beside a folder ``velodyne`` it
-    holds classes of SemanticKITTI, which become classes of KITTI-360.
+    folder, as `r3dpa data simulate` and `r3dpa sample` write it. Classes of SemanticKITTI become
+    classes of KITTI-360: labels beside a folder ``velodyne`` have them, and elsewhere labels whose
+    ids all are of SemanticKITTI and some are not of KITTI-360. Points that weather or a fault has
+    added keep :data:`lidarsim.weather.ADDED_CLASS` and above.
 
     Returns:
         ``(P,)`` KITTI-360 class in the lower 16 bits, see :data:`CLASS_NAMES`, 0 without a label;
@@ -132,7 +136,9 @@ def labels_of_cloud(cloud: PointCloud) -> NDArray[np.int64] | None:
 def classes_as_of_cloud(classes: NDArray[np.int64], cloud: PointCloud) -> NDArray[np.int64]:
     """KITTI-360 classes ``(P,)`` by the ids that the labels of a cloud have; 0 for unknown ones."""
     file = cloud.file
-    if file is None or not _is_semantic_kitti(file.path, file.label_path):
+    if file is None or cloud.labels is None:
+        return classes
+    if not _is_semantic_kitti(cloud.labels.astype(np.int64), file.path, file.label_path):
         return classes
     table = np.zeros(1 << 16, np.int64)
     for name, numbers in _SEMANTIC_KITTI_IDS.items():
@@ -149,9 +155,10 @@ def write_labels(path: str | Path, labels: Tensor) -> None:
 def _kitti_360(labels: NDArray[np.uint32], scan: Path, path: Path | None) -> NDArray[np.int64]:
     """Labels in the file ``path`` of a scan, with the classes of KITTI-360."""
     numbers = labels.astype(np.int64)
-    if not _is_semantic_kitti(scan, path):
+    if not _is_semantic_kitti(numbers, scan, path):
         return numbers
     table = np.full(1 << 16, -1)
+    table[ADDED_CLASS:] = np.arange(ADDED_CLASS, 1 << 16)
     table[list(_SEMANTIC_KITTI)] = list(_SEMANTIC_KITTI.values())
     classes = table[numbers & 0xFFFF]
     if (classes < 0).any():
@@ -160,9 +167,14 @@ def _kitti_360(labels: NDArray[np.uint32], scan: Path, path: Path | None) -> NDA
     return classes | numbers >> 16 << 16
 
 
-def _is_semantic_kitti(scan: Path, path: Path | None) -> bool:
-    """Whether the label file of a scan lies where SemanticKITTI has it."""
+def _is_semantic_kitti(labels: NDArray[np.int64], scan: Path, path: Path | None) -> bool:
+    """Whether labels are of SemanticKITTI, by the place of their file or else by their ids."""
     folder = scan.absolute().parent
-    return (
-        folder.name == "velodyne" and path is not None and path.parent == folder.parent / "labels"
-    )
+    is_its_place = path is not None and path.parent == folder.parent / "labels"
+    if folder.name == "velodyne" and is_its_place:
+        return True
+    # Scans that were converted or changed may have their labels elsewhere.
+    ids = np.flatnonzero(np.bincount(labels & 0xFFFF))
+    ids = ids[ids < ADDED_CLASS]
+    are_its_ids = np.isin(ids, list(_SEMANTIC_KITTI)).all()
+    return bool(are_its_ids and (ids > _LAST_OF_KITTI_360).any())
