@@ -341,8 +341,13 @@ def test_links_to_folders_are_followed_once(tmp_path, make_scans):
     (tmp_path / "plain/a").symlink_to(tmp_path / "elsewhere")
     (tmp_path / "plain/b/loop").symlink_to(tmp_path / "plain")
     (tmp_path / "plain/c").symlink_to(tmp_path / "plain/b")
+    make_scans(tmp_path / "plain/.trash", 1)
     names = ["a/0000000000", "a/0000000001", "b/0000000000"]
-    assert [scan.name for scan in find_scans(tmp_path / "plain")] == names
+    for source in ("plain", "plain/**/*.bin", "pl*/**/00*.bin", "plain/**/**"):
+        assert [scan.name for scan in find_scans(tmp_path / source)] == names
+    direct = [scan.drive for scan in find_scans(tmp_path / "plain/*/*0.bin")]
+    assert direct == ["a", "b", "c"]
+    assert [scan.name for scan in find_scans(tmp_path / "plain/**/b/**/*.bin")] == ["b/0000000000"]
 
 
 def test_missing_folders_are_named(tmp_path, make_scans):

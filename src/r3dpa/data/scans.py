@@ -6,7 +6,8 @@ import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from glob import has_magic
+from fnmatch import fnmatch
+from glob import glob, has_magic
 from multiprocessing.pool import ThreadPool
 from pathlib import Path
 from typing import Literal, TypeVar
@@ -159,8 +160,32 @@ def scan_files(entry: str | Path) -> Iterator[Path]:
     elif path.is_file():
         yield path
     elif has_magic(str(entry)):
-        root = Path(path.absolute().anchor)
-        yield from _of_one_format(path, root.glob(str(path.absolute().relative_to(root))))
+        yield from _of_one_format(path, _files_of_glob(path.absolute()))
+
+
+def _files_of_glob(pattern: Path) -> list[Path]:
+    """Files of a glob, with links and hidden files as in :func:`files_below`."""
+    parts = (*pattern.parts, "**")
+    fixed = Path(*parts[: parts.index("**")])
+    # Path.glob would take hidden folders.
+    places = [Path(name) for name in sorted(glob(str(fixed)))]  # noqa: PTH207
+    if fixed == pattern:
+        return places
+    return [
+        file
+        for root in places
+        for file in files_below(root)
+        if _matches(file.relative_to(root).parts, pattern.parts[len(fixed.parts) :])
+    ]
+
+
+def _matches(names: tuple[str, ...], pattern: tuple[str, ...]) -> bool:
+    """Whether the parts of a path match the parts of a glob, of which ``**`` is any number."""
+    if not pattern:
+        return not names
+    if pattern[0] == "**":
+        return any(_matches(names[start:], pattern[1:]) for start in range(len(names) + 1))
+    return bool(names) and fnmatch(names[0], pattern[0]) and _matches(names[1:], pattern[1:])
 
 
 def _of_one_format(source: Path, files: Iterable[Path]) -> list[Path]:
