@@ -33,7 +33,7 @@ def write(out, range_m, batch=2, **options):
         for first in range(open_writer.num_done, len(range_m), batch):
             open_writer.put(range_m[first : first + batch])
         open_writer.close()
-        open_writer.finish({"num": len(range_m)})
+        open_writer.finish({"num": len(range_m), "nfe": 8})
 
 
 def files(folder):
@@ -72,7 +72,7 @@ def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path):
         second.put(range_m[4:], nfe=4)
         second.close()
         assert second.evaluations == 2 * 7 + 2 * 10 + 3 * 4
-        second.finish({})
+        second.finish({"num": 7, "nfe": 6})
     assert np.array_equal(np.load(tmp_path / "range_m.npy"), range_m.numpy())
     assert (tmp_path / "bin" / "000003.bin").stat().st_mtime_ns == kept
     assert not [name for name in files(tmp_path) if name.startswith(".")]
@@ -100,7 +100,7 @@ def test_a_run_that_stops_before_its_last_file_only_needs_that(tmp_path):
     with writer(tmp_path, 2) as second:
         assert second.num_done == 2
         second.close()
-        second.finish({})
+        second.finish({"num": 7, "nfe": 6})
     assert np.array_equal(np.load(tmp_path / "range_m.npy"), range_m.numpy())
 
 
@@ -141,7 +141,7 @@ def test_another_request_is_refused_until_it_may_start_anew(tmp_path):
     write(tmp_path, scenes(1, seed=5), request=other, overwrite=True)
     assert files(tmp_path) == ["bin/000000.bin", "metadata.json", "range_m.npy"]
     with pytest.raises(ValueError, match=r"holds scenes already.*--overwrite"):
-        writer(tmp_path, 4, request=other)
+        writer(tmp_path, 1, request=other)
 
 
 def test_a_folder_with_other_scans_is_refused(tmp_path):
@@ -203,7 +203,7 @@ def test_an_unfinished_folder_of_an_earlier_version_is_completed(tmp_path):
         assert (second.num_done, second.evaluations) == (2, 6)
         second.put(range_m[2:])
         second.close()
-        second.finish({})
+        second.finish({"num": 7, "nfe": 6})
     assert np.array_equal(np.load(tmp_path / "range_m.npy"), range_m.numpy())
 
 
@@ -270,6 +270,11 @@ def test_files_of_somebody_else_are_never_removed(tmp_path):
     for overwrite in (False, True):
         with pytest.raises(ValueError, match="is in the way and no scenes of this command"):
             writer(tmp_path, 2, overwrite=overwrite)
+    for metadata in ('{"name": "their data set"}', '["num", "nfe"]', "their notes"):
+        (tmp_path / "metadata.json").write_text(metadata)
+        with pytest.raises(ValueError, match="is in the way and no scenes of this command"):
+            writer(tmp_path, 2, overwrite=True)
+        assert (tmp_path / "metadata.json").read_text() == metadata
     assert theirs.read_bytes() == b"a scan"
 
 

@@ -233,7 +233,6 @@ class SceneWriter:
 
     def _clear(self) -> None:
         """Remove the output of earlier runs, and nothing else."""
-        metadata = self.out / "metadata.json"
         for file in self.out.glob("[!.]*"):
             if file.name not in _WRITTEN and suffix_of(file) in READERS:
                 raise ValueError(
@@ -243,7 +242,7 @@ class SceneWriter:
             if (self.out / name).is_symlink():
                 raise ValueError(f"{self.out / name} is a link: remove it, or give another --out")
         written = [path for name in _WRITTEN if (path := self.out / name).exists()]
-        if written and not metadata.exists() and not self._journal.path.exists():
+        if written and not self._holds_scenes() and not self._journal.path.exists():
             raise ValueError(
                 f"{written[0]} is in the way and no scenes of this command lie in {self.out}; "
                 "give another --out"
@@ -251,8 +250,16 @@ class SceneWriter:
         # Marks the folder as ours, should this be interrupted.
         self.out.mkdir(parents=True, exist_ok=True)
         self._start_journal(0, 0)
-        metadata.unlink(missing_ok=True)
+        (self.out / "metadata.json").unlink(missing_ok=True)
         self._delete_scenes()
+
+    def _holds_scenes(self) -> bool:
+        """Whether the metadata in the folder is of scenes, not of another program."""
+        try:
+            metadata = json.loads((self.out / "metadata.json").read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return False
+        return isinstance(metadata, dict) and {"num", "nfe"} <= metadata.keys()
 
     def _delete_scenes(self) -> None:
         for path in (self._unfinished, *(self.out / name for name in _WRITTEN)):
