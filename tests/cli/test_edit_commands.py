@@ -333,6 +333,22 @@ def test_bad_input_is_refused_before_networks_run(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.usefixtures("no_sheet")
+@pytest.mark.parametrize("changed", ["a.bin", "m.png"])
+@pytest.mark.parametrize("command", ["inpaint", "complete"])
+def test_no_scene_is_added_to_those_of_other_inputs(files, tmp_path, command, changed):
+    source, out = tmp_path / "in", tmp_path / "out"
+    source.mkdir()
+    for name in ("a.bin", "m.png"):
+        (source / name).write_bytes((files / name).read_bytes())
+    scan = source / "a.bin" if command == "inpaint" else source
+    words = ["--scan", scan, "--mask", source / "m.png"]
+    edit(files, command, out, *words, num=1)
+    (source / changed).touch()
+    with pytest.raises(ValueError, match=rf"1 scenes of another request .*inputs.*{changed}"):
+        edit(files, command, out, *words, num=2)
+
+
 @pytest.mark.parametrize("command", ["vary", "complete --keep_every 2"])
 def test_no_edit_writes_into_the_folder_of_its_scans(files, tmp_path, command):
     write_bin(tmp_path / "scans" / "a.bin", read_scan(files / "a.bin"))

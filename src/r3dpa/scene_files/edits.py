@@ -14,8 +14,10 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from lidarsim.changed_scans import inputs_of
 from lidarsim.clouds import PointCloud
 from lidarsim.scan_files import out_of_range, read_scan
+from lidarsim.scan_folders import find_files
 from r3dpa import viz
 from r3dpa.checkpoints import read_checkpoint
 from r3dpa.data import PointSample, Scan, ScanError, pooled_grids
@@ -57,6 +59,15 @@ def refuse_inside(out: Path, scans: Iterable[Path]) -> None:
     for path in scans:
         if path.resolve().is_relative_to(out.resolve()):
             raise ValueError(f"{path} lies in --out {out}: give another folder as --out")
+
+
+def _about_files(source: Path) -> dict[str, list[int]]:
+    """Size and time of change of a file or of the scans of a folder, and of labels beside them."""
+    root, paths = find_files(source)
+    about: dict[str, list[int]] = {}
+    for path in paths:
+        about |= inputs_of(path, root)
+    return about
 
 
 class EditSession:
@@ -236,7 +247,14 @@ class EditSession:
         sources: Mapping[str, Any],
         guided: bool = False,
     ) -> dict[str, Any]:
-        """All that determines the results of a command, as JSON values."""
+        """All that determines the results of a command, as JSON values.
+
+        Of each file or folder among ``arguments``, the size and time of change of its files: scenes
+        are added to earlier ones only where these are the same.
+        """
+        inputs = {
+            name: _about_files(path) for name, path in arguments.items() if isinstance(path, Path)
+        }
         options, settings = self.options, asdict(self.settings)
         if not guided:
             del settings["strength"], settings["window"]
@@ -246,7 +264,8 @@ class EditSession:
         if options.columns:
             request["columns"] = options.columns
         request |= provenance(self.checkpoint, options, self.num, self.device, self.geometry)
-        request |= {"command": command, "guided": guided, "settings": settings, **sources}
+        request |= {"command": command, "guided": guided, "settings": settings, "inputs": inputs}
+        request |= sources
         return dict(json_values(request, default=str))  # paths as text
 
     @contextmanager
