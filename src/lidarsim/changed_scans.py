@@ -48,6 +48,17 @@ def refuse_outside(path: Path, out: Path) -> None:
         raise ScanError(f"{path}: a link leads out of {out}; give another --out")
 
 
+def refuse_folder_of_scans(out: Path, root: Path, num_scans: int) -> None:
+    """Refuse to write results where a later run would read them as scans of the folder ``root``.
+
+    Raises:
+        ValueError: With the name of ``out``.
+    """
+    place, above = out.resolve(), root.resolve()
+    if place == above or (place.is_relative_to(above) and num_scans > 1):
+        raise ValueError(f"--out {out} is the folder of the scans, or in it: give another one")
+
+
 def inputs_of(path: Path, root: Path) -> dict[str, list[int]]:
     """Size and time of change in ns of a scan and its labels, by their names from ``root``."""
     inputs = {}

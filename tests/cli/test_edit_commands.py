@@ -358,6 +358,15 @@ def test_no_edit_writes_into_the_folder_of_its_scans(files, tmp_path, command):
     assert (tmp_path / "scans" / "a.bin").exists()
 
 
+def test_a_folder_is_not_completed_into_itself(files, tmp_path):
+    """The next run would take the completed scans for scans to complete."""
+    for name in ("a.bin", "b.bin"):
+        write_bin(tmp_path / name, read_scan(files / name))
+    with pytest.raises(ValueError, match=r"--out .*done is the folder of the scans, or in it"):
+        edit(files, "complete", tmp_path / "done", "--scan", tmp_path, "--keep_every", 2, num=1)
+    assert not (tmp_path / "done").exists()
+
+
 @pytest.mark.parametrize(
     "words",
     [

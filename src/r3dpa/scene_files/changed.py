@@ -13,7 +13,13 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from lidarsim.changed_scans import inputs_of, refuse_outside, refuse_shared_labels, write_below
+from lidarsim.changed_scans import (
+    inputs_of,
+    refuse_folder_of_scans,
+    refuse_outside,
+    refuse_shared_labels,
+    write_below,
+)
 from lidarsim.clouds import PointCloud, read_cloud
 from lidarsim.drive_files import to_json, write
 from lidarsim.recorded import RecordedScan
@@ -165,9 +171,7 @@ def _change(
 def _check_out(root: Path, out: Path, files: list[Path], request: dict[str, Any]) -> None:
     """Refuse a folder of other files or results, before anything is written."""
     check_folder(out)
-    place, above = out.resolve(), root.resolve()
-    if place == above or (place.is_relative_to(above) and len(files) > 1):
-        raise ValueError(f"--out {out} is the folder of the scans, or in it: give another one")
+    refuse_folder_of_scans(out, root, len(files))
     if (out / _REQUEST).is_file():
         before = json.loads((out / _REQUEST).read_text())
         if different := "; ".join(differences(before, request)):

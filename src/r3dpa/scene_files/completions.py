@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from tqdm import tqdm
 
-from lidarsim.changed_scans import write_below
+from lidarsim.changed_scans import refuse_folder_of_scans, write_below
 from lidarsim.clouds import PointCloud, read_cloud
 from lidarsim.scan_folders import find_files
 from r3dpa.data.labels import classes_as_of_cloud
@@ -153,6 +153,7 @@ def complete_files(
     root, paths = find_files(source)
     options, num = job.options, job.num
     refuse_inside(options.out, paths)
+    refuse_folder_of_scans(options.out, root, len(paths))
     session = _session(options, num)
     stage = session.checkpoint.stage
     if job.start is not None and session.baseline is not None:
