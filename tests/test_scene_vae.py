@@ -7,9 +7,7 @@ from tiny_labelled import labelled_checkpoint
 from tiny_networks import GEOMETRY, tiny_checkpoint
 
 from r3dpa import SceneVAE
-from r3dpa.geometry import (
-    range_image,
-)
+from r3dpa.geometry import points_of, range_image
 
 
 @pytest.fixture(scope="module")
@@ -87,12 +85,28 @@ def test_a_scan_and_its_labels_become_latents_and_a_labelled_scene(tmp_path):
         vae.encode(points * torch.tensor([1.0, 1, 1, 255]), labels)
 
 
+def test_a_single_bright_return_counts_as_full_scale(tmp_path):
+    """As in training: sensors report more than their full scale here and there."""
+    vae = SceneVAE.from_checkpoint(labelled_checkpoint(tmp_path), device="cpu")
+    torch.nn.init.normal_(vae.vae.encoder.further_in.weight)
+    points = points_of(torch.full((16, 64), 10.0), vae.geometry.projection)
+    points = torch.cat([points, torch.full((1024, 1), 0.5)], dim=1)
+    points[100, 3] = 1.0
+    bright = points.clone()
+    bright[100, 3] = 1.3
+    assert vae.encode(bright).equal(vae.encode(points))
+    bright[101, 3] = 1.3  # two of 1024 are more than 0.1 %
+    with pytest.raises(ValueError, match=r"intensities up to 1\.3; the model needs 0\.\.1"):
+        vae.encode(bright)
+
+
 def test_an_encoder_of_range_and_return_needs_no_intensity(tmp_path):
     vae = SceneVAE.from_checkpoint(labelled_checkpoint(tmp_path, encode_further=False), "cpu")
     points = 10 * torch.randn(500, 4, generator=torch.Generator().manual_seed(0))
     points[:, 3] = 0.5
     latents = vae.encode(points, torch.full((500,), 26))
     assert torch.equal(latents, vae.encode(points[:, :3]))
+    assert torch.equal(latents, vae.encode(points * torch.tensor([1.0, 1, 1, 255])))
     scenes = vae.decode(latents)
     assert torch.equal(scenes.labels > 0, scenes.range_m > 0)
     assert scenes.intensity[scenes.range_m > 0].unique().numel() > 20

@@ -15,7 +15,7 @@ from r3dpa.generation import geometry_of, open_checkpoint
 from r3dpa.geometry import ScanGeometry
 from r3dpa.io import usable_device
 from r3dpa.nn import VAE
-from r3dpa.scenes import ScanLike, SceneBatch, check_intensities, scan_pixels
+from r3dpa.scenes import ScanLike, SceneBatch, clamp_intensities, scan_pixels
 
 
 class SceneVAE:
@@ -82,13 +82,12 @@ class SceneVAE:
                 trained on.
 
         Raises:
-            ValueError: As :func:`r3dpa.scenes.scan_pixels`, and for intensities above 1 that the
-                images of the model have a channel for.
+            ValueError: As :func:`r3dpa.scenes.scan_pixels`, and if the VAE encodes intensities and
+                more than 0.1 % of them are above 1.
         """
         pixels = scan_pixels(scan, self.geometry.projection, labels)
-        check_intensities(pixels, self.geometry.codec)
         codec = self.vae.codec_of_input(self.geometry.codec)
-        image = codec.to_image(*pixels).to(self.device)
+        image = codec.to_image(*clamp_intensities(pixels, codec)).to(self.device)
         return self.vae.encode(image[None]).mean
 
     @torch.no_grad()

@@ -20,6 +20,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from lidarsim.cloud_formats import ODD_SHARE
 from lidarsim.clouds import PointCloud, read_cloud
 from r3dpa.geometry import (
     EMPTY_RANGE_M,
@@ -115,19 +116,21 @@ def _points_of_scan(scan: ScanLike) -> tuple[Any, ArrayLike | None]:
     return np.column_stack([scan.points, np.asarray(intensity, dtype=np.float32)]), labels
 
 
-def check_intensities(pixels: Pixels, codec: RangeCodec) -> None:
-    """Refuse intensities above 1, where images of the codec have a channel for them.
+def clamp_intensities(pixels: Pixels, codec: RangeCodec) -> Pixels:
+    """Clamp single bright returns to an intensity of 1, if images of the codec show intensities.
 
     Raises:
-        ValueError: With the largest intensity.
+        ValueError: With the largest intensity, if more than 0.1 % of the returns are above 1.
     """
     intensity = pixels.intensity
-    uses_intensity = codec.intensity_channel or codec.reflectance
-    if uses_intensity and intensity is not None and intensity.max() > 1:
+    if intensity is None or not (codec.intensity_channel or codec.reflectance):
+        return pixels
+    if (intensity > 1).sum() > ODD_SHARE * (pixels.range_m > 0).sum():
         raise ValueError(
             f"the scan has intensities up to {intensity.max():g}; the model needs 0..1: divide "
             "them by their full scale, such as 255"
         )
+    return pixels._replace(intensity=intensity.clamp(max=1))
 
 
 def _within_limits(range_m: Tensor, projection: Projection) -> Tensor:

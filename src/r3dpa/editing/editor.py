@@ -35,7 +35,7 @@ from r3dpa.flow.solvers import AfterStep, Velocity, evaluations, ode_solver, unc
 from r3dpa.flow.times import batch_time
 from r3dpa.generation import SamplerConfig, SceneGenerator, scene_indices
 from r3dpa.geometry import Pixels, labels_of
-from r3dpa.scenes import ScanLike, SceneBatch, check_intensities, map_pixels, scan_pixels
+from r3dpa.scenes import ScanLike, SceneBatch, clamp_intensities, map_pixels, scan_pixels
 
 COMPLETION_START = 0.2  #: time of the noise that completions start from
 _COMPLETION_DRAWS = 3  # their median has a smaller error than one draw
@@ -145,7 +145,9 @@ class SceneEditor:
 
     def pixels(self, scan: ScanLike) -> Pixels:
         """Pixels ``(H, W)`` of a scan in the projection of the model, on the CPU."""
-        return scan_pixels(scan, self.generator.geometry.projection)
+        geometry = self.generator.geometry
+        # Also where the encoder does not see intensities: results have them beside generated ones.
+        return clamp_intensities(scan_pixels(scan, geometry.projection), geometry.codec)
 
     @torch.no_grad()
     def inpaint(
@@ -373,7 +375,6 @@ class SceneEditor:
     def _encode(self, pixels: Pixels) -> Tensor:
         """Normalised latents of pixels ``(B, H, W)``."""
         codec, vae = self.generator.geometry.codec, self.generator.vae
-        check_intensities(pixels, codec)
         pixels = map_pixels(lambda values: values.to(self.generator.device), pixels)
         image = vae.codec_of_input(codec).to_image(*pixels)
         return self.generator.latent_norm.normalise(vae.encode(image).mean)
