@@ -119,6 +119,16 @@ def test_intensity_and_class_are_those_of_the_nearest_points(labelled_root):
     assert row.stat().st_size == 4 * 3 * 16 * 64  # four scans, three bytes a pixel
 
 
+def test_images_of_reflectance_are_cached_with_it(labelled_root):
+    data = module(labelled_root, codec=RangeCodec("log2", reflectance=True), num_scans=4)
+    data.setup("fit")
+    labelled = module(labelled_root, codec=LABELLED, num_scans=4)
+    labelled.setup("fit")
+    reflectance = data.train_set[0]["range_image"][1]
+    assert len(reflectance.unique()) > 5
+    assert torch.equal(reflectance, labelled.train_set[0]["range_image"][2])
+
+
 def test_cached_images_and_files_of_the_same_scans_agree(labelled_root, tmp_path):
     settings = {"sensor": SMALL, "codec": LABELLED, "grid_size": (4, 8), "num_scans": 2}
     settings |= {"simulation_sensor": "vlp16"}

@@ -92,9 +92,9 @@ class SimulatedImageDataModule(SimulatedDataModule):
 
     Images are made before the first use: only what is missing, eight scans between two writes. A
     larger ``num_scans`` adds to the images of an earlier run. Ranges are rounded to 11 bits, 1 cm
-    at 20 m. Where the codec has channels of intensity or class, both are cached beside the range,
-    197 kB each. Feature grids are made of the points of these pixels, so that an extractor that
-    comes later needs no simulation.
+    at 20 m. Where the codec has channels of intensity, reflectance or class, intensity and class
+    are cached beside the range, 197 kB each. Feature grids are made of the points of these pixels,
+    so that an extractor that comes later needs no simulation.
 
     Args:
         root: Folder of the caches.
@@ -158,7 +158,8 @@ class SimulatedImageDataModule(SimulatedDataModule):
     @property
     def has_values(self) -> bool:
         """Whether intensity and class are cached beside the range."""
-        return self.codec.intensity_channel or self.codec.num_classes > 0
+        codec = self.codec
+        return codec.reflectance or codec.intensity_channel or codec.num_classes > 0
 
     @property
     def _sensor_values(self) -> Any:
