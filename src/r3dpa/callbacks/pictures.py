@@ -31,10 +31,10 @@ class ReconstructionWriter(L.Callback):
         """Refuse scans of equal names, as two data sets may have them: their files would be one."""
         dataset = getattr(cast(Any, trainer).datamodule, "all_set", None)
         scans = [] if dataset is None else dataset.scans
-        for name, count in Counter(scan.name for scan in scans).items():
+        for name, count in Counter(_file_name(scan.name) for scan in scans).items():
             if count > 1:
                 raise ValueError(
-                    f"{count} scans have the name {name}: predict each data set by itself"
+                    f"{count} scans would be written as {name}: predict each data set by itself"
                 )
 
     def on_predict_batch_end(
@@ -50,11 +50,16 @@ class ReconstructionWriter(L.Callback):
         folder = _reconstructions(trainer)
         for name, range_m in zip(batch["name"], outputs.float().cpu(), strict=True):
             points = points_of(range_m, pl_module.scan_geometry.projection)
-            write_bin(folder / f"{name}.bin", points)
+            write_bin(folder / _file_name(name), points)
 
     def on_predict_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Name the folder."""
         rank_zero_info(f"reconstructions: {_reconstructions(trainer)}")
+
+
+def _file_name(scan_name: str) -> str:
+    """File of a reconstruction; ``.pcd.bin``, as nuScenes has it, is of five columns."""
+    return f"{scan_name.removesuffix('.pcd')}.bin"
 
 
 def _reconstructions(trainer: L.Trainer) -> Path:
