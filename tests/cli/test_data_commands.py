@@ -253,8 +253,10 @@ class TestCheck:
         status, lines = check(tmp_path, capsys)
         assert status == 1
         assert "rather of 6 columns: name the columns with --columns" in "".join(lines)
-        main(["check", str(tmp_path), "--columns", "x,y,z,intensity,ring,time"])
-        assert "(x, y, z, intensity, ring, time), 200 points" in capsys.readouterr().out
+        columns = ["--columns", "x,y,z,intensity,ring,time"]
+        for words in ([str(tmp_path), *columns], [*columns, str(tmp_path)]):
+            main(["check", *words])
+            assert "(x, y, z, intensity, ring, time), 200 points" in capsys.readouterr().out
 
 
 class TestObjects:

@@ -148,6 +148,7 @@ def join_list_words(parser: Parser, words: Sequence[str]) -> list[str]:
     """Write the words after each list option as one, as jsonargparse expects them.
 
     ``--box -10 10 -20 0``, ``--box -10,10,-20,0`` and ``--box '[-10, 10, -20, 0]'`` are the same.
+    A word in brackets or with commas is a whole list: the next one may be of the command.
     """
     item_types = {
         name: _item_types(getattr(action, "_typehint", None))
@@ -165,6 +166,8 @@ def join_list_words(parser: Parser, words: Sequence[str]) -> list[str]:
         items = [value] if equals else []
         while rest and not equals and not _is_option(rest[0]):
             items.append(rest.pop(0))
+            if items[-1].lstrip().startswith("[") or "," in items[-1]:
+                break
         if items and not items[0].lstrip().startswith("["):
             items = [part.strip() for item in items for part in item.split(",")]
             if not item_types[name] <= {int, float}:
