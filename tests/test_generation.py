@@ -333,6 +333,12 @@ def test_a_generator_says_what_it_is_in_one_line():
     )
 
 
+def test_tensors_of_scenes_can_be_changed_and_are_inputs_of_autograd():
+    scenes = generator(ODE).generate([0])
+    scenes.range_m[0, 0, 0] = 5.0
+    assert (scenes.latents * torch.ones((), requires_grad=True)).sum().requires_grad
+
+
 def test_progress_is_shown_on_request(capsys):
     scenes = generator(ODE)
     quiet = scenes.generate([0])

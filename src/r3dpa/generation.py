@@ -268,7 +268,7 @@ class SceneGenerator:
         other.sampler, other._prepared = sampler, None
         return other
 
-    @torch.inference_mode()
+    @torch.no_grad()
     def prepare(self) -> None:
         """Precompute the modulations of all times of the solver, which the first scene needs.
 
@@ -294,7 +294,7 @@ class SceneGenerator:
             self._velocity = autoguided(self._strong, weak, guide.scale, guide.interval)
         self._prepared = (self.sampler, self.device)
 
-    @torch.inference_mode()
+    @torch.no_grad()
     def generate(
         self, indices: int | Sequence[int], seed: int = 0, *, progress: bool = False
     ) -> SceneBatch:

@@ -77,7 +77,7 @@ class BaselineGenerator:
             velocity = self.baseline.velocity(self._called, x.float(), time.float())
         return velocity.to(x.dtype)
 
-    @torch.inference_mode()
+    @torch.no_grad()
     def generate(self, indices: int | Sequence[int], seed: int = 0) -> SceneBatch:
         """Draw one scene per index; arguments as of :meth:`r3dpa.SceneGenerator.generate`."""
         indices = scene_indices(indices)
@@ -105,7 +105,7 @@ class BaselineGenerator:
         intensity = (image[:, 1] + 1) / 2 if codec.reflectance else None
         return SceneBatch(range_m, latents, self.calls, projection, intensity)
 
-    @torch.inference_mode()
+    @torch.no_grad()
     def complete(
         self,
         image: Tensor,
