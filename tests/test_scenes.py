@@ -108,6 +108,13 @@ def test_returns_beyond_the_limits_are_left_out_as_of_points():
         assert (range_m[3:] == 20).all()
 
 
+def test_labels_of_points_are_refused_where_a_scan_has_pixels(labelled):
+    image = torch.full((16, 64), 20.0)
+    for scan in (image, Pixels(image), labelled[0]):
+        with pytest.raises(ValueError, match="labels are of points, but the scan is a range"):
+            scan_pixels(scan, PROJECTION, np.full(1024, 26))
+
+
 def test_scenes_that_are_no_scan_of_these_images(labelled):
     sensor = PROJECTION.sensor
     for wrong, message in (

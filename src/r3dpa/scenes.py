@@ -61,8 +61,8 @@ def scan_pixels(scan: ScanLike, projection: Projection, labels: ArrayLike | None
         labels: ``(P,)`` KITTI-360 class of each point in the lower 16 bits; default: of the scan.
 
     Raises:
-        ValueError: If the scan is of another shape, has a value that is not finite, or has no point
-            within the range limits.
+        ValueError: If the scan is of another shape, has a value that is not finite, has no point
+            within the range limits, or has pixels and ``labels`` are given.
     """
     if isinstance(scan, SceneBatch):
         raise ValueError(f"a scan is one scene, got {len(scan)}: give one of them, as scenes[0]")
@@ -70,12 +70,14 @@ def scan_pixels(scan: ScanLike, projection: Projection, labels: ArrayLike | None
         classes = None if scan.labels is None else classes_of(scan.labels.cpu())
         scan = Pixels(scan.range_m, scan.intensity, classes)
     if isinstance(scan, Pixels):
+        _refuse_labels(labels)
         scan = map_pixels(torch.Tensor.cpu, scan)
         return scan._replace(range_m=_within_limits(scan.range_m, projection))
     points, own_labels = _points_of_scan(scan)
     values = torch.as_tensor(points).detach().cpu().float()
     sensor = projection.sensor
     if values.shape == (sensor.beams, sensor.columns):
+        _refuse_labels(labels)
         return Pixels(_within_limits(values, projection))
     if values.ndim != 2 or values.shape[1] not in (3, 4):
         raise ValueError(
@@ -93,6 +95,12 @@ def scan_pixels(scan: ScanLike, projection: Projection, labels: ArrayLike | None
     labels = own_labels if labels is None else labels
     given = None if labels is None else torch.from_numpy(np.asarray(labels, dtype=np.int64))
     return project_pixels(values, projection, given)
+
+
+def _refuse_labels(labels: ArrayLike | None) -> None:
+    """Refuse labels of points for a scan that has pixels in their place."""
+    if labels is not None:
+        raise ValueError("labels are of points, but the scan is a range image: give its points")
 
 
 def _points_of_scan(scan: ScanLike) -> tuple[Any, ArrayLike | None]:
