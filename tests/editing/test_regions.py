@@ -90,6 +90,7 @@ def test_a_sector_and_the_rest_of_the_turn_share_no_pixel_and_leave_none():
         (lambda: sector(COARSE, -180, 180), "all of 4 x 36"),
         (lambda: sector(COARSE, 1, 2), "between two columns, which are 10 degrees"),
         (lambda: sector(COARSE, 10, 10), "give -180 and 180"),
+        (lambda: sector(COARSE, 180, -180), "is empty: for a full turn give -180 and 180"),
         (lambda: sector(COARSE, -200, 200), "at most 360 apart"),
         (lambda: sector(COARSE, math.nan, 20), r"-360\.\.360"),
         (lambda: sector(COARSE, 20, math.nan), r"-360\.\.360"),

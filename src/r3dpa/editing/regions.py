@@ -307,9 +307,9 @@ def _between(projection: Projection, from_deg: float, to_deg: float, what: str) 
     are_turns = abs(from_deg) <= _TURN_DEG and abs(to_deg) <= _TURN_DEG  # NaN is not
     if not are_turns or to_deg - from_deg > _TURN_DEG:
         raise ValueError(f"{what}: azimuths must lie in -360..360 degrees, at most 360 apart")
-    if from_deg == to_deg:
-        raise ValueError(f"{what} is empty: for a full turn give -180 and 180")
     width = _TURN_DEG if to_deg - from_deg == _TURN_DEG else (to_deg - from_deg) % _TURN_DEG
+    if width == 0:
+        raise ValueError(f"{what} is empty: for a full turn give -180 and 180")
     columns = (_rays_deg(projection)[1] - from_deg) % _TURN_DEG < width
     if not columns.any():
         pitch = _TURN_DEG / projection.sensor.columns
