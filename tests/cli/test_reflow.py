@@ -37,6 +37,7 @@ def pairs_root(tmp_path_factory):
 
 def pairs_of(flow, root, num_pairs=7, rank=0, barrier=lambda: None, processes=1):
     pairs = ReflowPairs(str(root), str(flow), num_pairs, SAMPLER, 2, 3, "cpu")
+    assert not pairs.prepare_data_per_node  # all nodes share the work
     strategy = SimpleNamespace(barrier=lambda _: barrier())
     pairs.trainer = SimpleNamespace(
         strategy=strategy,

@@ -80,6 +80,7 @@ class ReflowPairs(LoaderModule):
         seed: int = 0,
     ) -> None:
         super().__init__(batch_size, num_workers, seed)
+        self.prepare_data_per_node = False  # all processes share the pairs, on all nodes
         at_least(1, num_held_out=num_held_out, generation_batch=generation_batch)
         at_least(num_held_out + 1, num_pairs=num_pairs)
         self.root, self.checkpoint, self.num_pairs = root, checkpoint, num_pairs
