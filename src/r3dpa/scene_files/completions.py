@@ -216,7 +216,10 @@ def _completed_cloud(
         added_intensity = intensity[nearest]
         if result.intensity is not None:
             shares = values_at_returns(result.intensity[index], range_m, projection).numpy()
-            added_intensity = (cloud.full_intensity * shares).astype(intensity.dtype)
+            added_intensity = cloud.full_intensity * shares
+            if intensity.dtype.kind in "iu":
+                added_intensity = np.rint(added_intensity)
+            added_intensity = added_intensity.astype(intensity.dtype)
         intensity = np.concatenate([intensity, added_intensity])
     if labels is not None:
         added_labels = np.zeros(len(added), labels.dtype)
