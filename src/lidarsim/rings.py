@@ -13,8 +13,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from lidarsim.recorded import RecordedScan
 from lidarsim.ring_order import rings_in_order
-from lidarsim.sensors.beams import phase_of
-from lidarsim.sensors.view import LidarSensor, angles_of
+from lidarsim.sensors.view import LidarSensor, angles_of, phase_of
 
 How = Literal["stored", "order", "inclination"]
 _MOST_BEAMS = 256

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.signal import find_peaks
 
+from lidarsim.sensors.view import phase_of
+
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
@@ -188,16 +190,6 @@ def _lateral(
     product = np.bincount(beam, change * rest, num_beams)
     lateral_m = np.divide(product, square, out=np.zeros(num_beams), where=square > 0)
     return lateral_m.clip(-_MOST_LATERAL_M, _MOST_LATERAL_M)
-
-
-def phase_of(beam: Indices, azimuth: Floats, columns: int, num_beams: int) -> tuple[Floats, Floats]:
-    """Azimuth offset within a column, in [0, column), and coherence of each beam, ``(H,)``."""
-    turns = columns * azimuth
-    counts = np.bincount(beam, minlength=num_beams).clip(1)
-    real = np.bincount(beam, np.cos(turns), num_beams) / counts
-    imaginary = np.bincount(beam, np.sin(turns), num_beams) / counts
-    offset = (np.arctan2(imaginary, real) % (2 * math.pi)) / columns
-    return offset, np.hypot(real, imaginary)
 
 
 def _most_coherent(group: Indices, azimuth: Floats, guess: float) -> tuple[int, float]:

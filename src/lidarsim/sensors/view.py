@@ -131,6 +131,21 @@ def angles_of(points: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArra
     return np.arctan2(z, np.hypot(x, y)), np.arctan2(y, x)
 
 
+def phase_of(
+    beam: NDArray[np.int64], azimuth: NDArray[np.float64], columns: int, num_beams: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Azimuth offset within a column and coherence of each beam, ``(H,)``.
+
+    The offset is in [0, 2 pi / columns); the coherence is 1 if all azimuths of a beam have it.
+    """
+    turns = columns * azimuth
+    counts = np.bincount(beam, minlength=num_beams).clip(1)
+    real = np.bincount(beam, np.cos(turns), num_beams) / counts
+    imaginary = np.bincount(beam, np.sin(turns), num_beams) / counts
+    offset = (np.arctan2(imaginary, real) % (2 * math.pi)) / columns
+    return offset, np.hypot(real, imaginary)
+
+
 def hit_pixels(points: NDArray[np.floating], sensor: LidarSensor) -> NDArray[np.bool_]:
     """Pixels ``(H, W)`` of the spherical projection with a return of ``(P, 3)`` within range."""
     inclination, azimuth = angles_of(points[in_range(points, sensor)])
