@@ -79,8 +79,8 @@ def test_a_scan_and_its_labels_become_latents_and_a_labelled_scene(tmp_path):
     scenes = vae.decode(latents)
     assert torch.equal(scenes.labels > 0, scenes.range_m > 0)
     assert scenes.intensity.shape == (1, 16, 64)
-    with pytest.raises(ValueError, match="needs scans with an intensity"):
-        vae.encode(points[:, :3], labels)
+    dark = points * torch.tensor([1.0, 1, 1, 0])
+    assert vae.encode(points[:, :3], labels).equal(vae.encode(dark, labels))
     with pytest.raises(ValueError, match=r"intensities up to 2.*; the model needs 0\.\.1"):
         vae.encode(points * torch.tensor([1.0, 1, 1, 255]), labels)
 

@@ -15,7 +15,13 @@ from r3dpa.generation import geometry_of, open_checkpoint
 from r3dpa.geometry import ScanGeometry
 from r3dpa.io import usable_device
 from r3dpa.nn import VAE
-from r3dpa.scenes import ScanLike, SceneBatch, clamp_intensities, scan_pixels
+from r3dpa.scenes import (
+    ScanLike,
+    SceneBatch,
+    clamp_intensities,
+    scan_pixels,
+    with_unknown_intensity,
+)
 
 
 class SceneVAE:
@@ -75,11 +81,11 @@ class SceneVAE:
         """Posterior means ``(1, C, h, w)`` of one scan.
 
         Args:
-            scan: Points ``(P, 3)`` in metres, or ``(P, 4)`` with the intensity, which some VAEs
-                need, or another :data:`r3dpa.scenes.ScanLike`.
+            scan: Points ``(P, 3)`` in metres, or ``(P, 4)`` with the intensity, or another
+                :data:`r3dpa.scenes.ScanLike`.
             labels: ``(P,)`` KITTI-360 class in the lower 16 bits, for a VAE of classes, unless the
-                scan has them; without, it sees returns of no class, which it has hardly been
-                trained on.
+                scan has them. A VAE that encodes intensity or class sees 0 and no class where a
+                scan has none, which it knows if it was trained with ``further_dropout``.
 
         Raises:
             ValueError: As :func:`r3dpa.scenes.scan_pixels`, and if the VAE encodes intensities and
@@ -87,7 +93,8 @@ class SceneVAE:
         """
         pixels = scan_pixels(scan, self.geometry.projection, labels)
         codec = self.vae.codec_of_input(self.geometry.codec)
-        image = codec.to_image(*clamp_intensities(pixels, codec)).to(self.device)
+        pixels = with_unknown_intensity(clamp_intensities(pixels, codec), codec)
+        image = codec.to_image(*pixels).to(self.device)
         return self.vae.encode(image[None]).mean
 
     @torch.no_grad()

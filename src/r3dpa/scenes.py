@@ -124,6 +124,16 @@ def _points_of_scan(scan: ScanLike) -> tuple[Any, ArrayLike | None]:
     return np.column_stack([scan.points, np.asarray(intensity, dtype=np.float32)]), labels
 
 
+def with_unknown_intensity(pixels: Pixels, codec: RangeCodec) -> Pixels:
+    """Pixels with an intensity of 0 where they have none and images of the codec need one.
+
+    Encoders that were trained with ``further_dropout`` take it for unknown.
+    """
+    if pixels.intensity is None and codec.intensity_channel:
+        return pixels._replace(intensity=torch.zeros_like(pixels.range_m))
+    return pixels
+
+
 def clamp_intensities(pixels: Pixels, codec: RangeCodec) -> Pixels:
     """Clamp single bright returns to an intensity of 1, if images of the codec show intensities.
 

@@ -325,8 +325,8 @@ class TestLabels:
         assert latents.equal(expected)
         trucks = replace(recorded, labels=recorded.labels + 1)
         assert not latents.equal(labelled.encode(trucks))
-        with pytest.raises(ValueError, match="needs scans with an intensity"):
-            labelled.encode(recorded.points)
+        dark = replace(recorded, intensity=0 * recorded.intensity, labels=None)
+        assert labelled.encode(recorded.points).equal(labelled.encode(dark))
         with pytest.raises(ValueError, match=r"intensities up to 2\d\d.*divide them by their full"):
             labelled.encode(replace(recorded, intensity=255 * recorded.intensity))
 

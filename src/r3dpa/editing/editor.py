@@ -8,6 +8,7 @@ F feature width.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import islice
@@ -35,7 +36,14 @@ from r3dpa.flow.solvers import AfterStep, Velocity, evaluations, ode_solver, unc
 from r3dpa.flow.times import batch_time
 from r3dpa.generation import SamplerConfig, SceneGenerator, scene_indices
 from r3dpa.geometry import Pixels, labels_of
-from r3dpa.scenes import ScanLike, SceneBatch, clamp_intensities, map_pixels, scan_pixels
+from r3dpa.scenes import (
+    ScanLike,
+    SceneBatch,
+    clamp_intensities,
+    map_pixels,
+    scan_pixels,
+    with_unknown_intensity,
+)
 
 COMPLETION_START = 0.2  #: time of the noise that completions start from
 _COMPLETION_DRAWS = 3  # their median has a smaller error than one draw
@@ -376,7 +384,8 @@ class SceneEditor:
         """Normalised latents of pixels ``(B, H, W)``."""
         codec, vae = self.generator.geometry.codec, self.generator.vae
         pixels = map_pixels(lambda values: values.to(self.generator.device), pixels)
-        image = vae.codec_of_input(codec).to_image(*pixels)
+        codec = vae.codec_of_input(codec)
+        image = codec.to_image(*with_unknown_intensity(pixels, codec))
         return self.generator.latent_norm.normalise(vae.encode(image).mean)
 
     def _result(
@@ -436,6 +445,12 @@ class SceneEditor:
             latents, guidance = solve(noise)
             parts.append(latents)
             if guidance is not None:
+                if guidance.num_dropped:
+                    warnings.warn(
+                        f"{guidance.num_dropped} gradients of the guidance were not finite and "
+                        "left out",
+                        stacklevel=2,
+                    )
                 cosines.append(-guidance.energy(latents, batch_time(0.0, latents)).cpu())
         return torch.cat(parts), torch.cat(cosines) if cosines else None
 
