@@ -254,7 +254,12 @@ class TestCheck:
         assert status == 1
         assert "rather of 6 columns: name the columns with --columns" in "".join(lines)
         columns = ["--columns", "x,y,z,intensity,ring,time"]
-        for words in ([str(tmp_path), *columns], [*columns, str(tmp_path)]):
+        apart = ["--columns", "x,", "y,", "z,", "intensity,", "ring,", "time"]
+        for words in (
+            [*columns, str(tmp_path)],
+            [str(tmp_path), *columns],
+            [str(tmp_path), *apart],
+        ):
             main(["check", *words])
             assert "(x, y, z, intensity, ring, time), 200 points" in capsys.readouterr().out
 

@@ -148,7 +148,8 @@ def join_list_words(parser: Parser, words: Sequence[str]) -> list[str]:
     """Write the words after each list option as one, as jsonargparse expects them.
 
     ``--box -10 10 -20 0``, ``--box -10,10,-20,0`` and ``--box '[-10, 10, -20, 0]'`` are the same.
-    A word in brackets or with commas is a whole list: the next one may be of the command.
+    A word in brackets, or with commas between its items, is a whole list: the next one may belong to
+    the command.
     """
     item_types = {
         name: _item_types(getattr(action, "_typehint", None))
@@ -166,7 +167,7 @@ def join_list_words(parser: Parser, words: Sequence[str]) -> list[str]:
         items = [value] if equals else []
         while rest and not equals and not _is_option(rest[0]):
             items.append(rest.pop(0))
-            if items[-1].lstrip().startswith("[") or "," in items[-1]:
+            if len(items) == 1 and _is_whole_list(items[0].strip()):
                 break
         if items and not items[0].lstrip().startswith("["):
             items = [part.strip() for item in items for part in item.split(",")]
@@ -175,6 +176,13 @@ def join_list_words(parser: Parser, words: Sequence[str]) -> list[str]:
             items = [f"[{', '.join(items)}]"]
         joined += [name, *items]
     return joined
+
+
+def _is_whole_list(word: str) -> bool:
+    """Whether a word holds all items of a list; more follow after a comma at its end."""
+    if word.startswith("["):
+        return word.endswith("]")
+    return "," in word and not word.endswith(",")
 
 
 def _is_option(word: str) -> bool:
