@@ -148,7 +148,7 @@ def join_list_words(parser: Parser, words: Sequence[str]) -> list[str]:
     """Write the words after each list option as one, as jsonargparse expects them.
 
     ``--box -10 10 -20 0``, ``--box -10,10,-20,0`` and ``--box '[-10, 10, -20, 0]'`` are the same.
-    A word in brackets, or with commas between its items, is a whole list: the next one may belong to
+    A word in brackets, or with commas between its items, is a whole list: the next one may be of
     the command.
     """
     item_types = {
@@ -170,7 +170,7 @@ def join_list_words(parser: Parser, words: Sequence[str]) -> list[str]:
             if len(items) == 1 and _is_whole_list(items[0].strip()):
                 break
         if items and not items[0].lstrip().startswith("["):
-            items = [part.strip() for item in items for part in item.split(",")]
+            items = [part.strip() for part in ",".join(items).split(",") if part.strip()]
             if not item_types[name] <= {int, float}:
                 items = [json.dumps(item) for item in items]
             items = [f"[{', '.join(items)}]"]
