@@ -8,7 +8,7 @@ import pytest
 import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 
-from lidarsim import Simulator
+from lidarsim import Simulator, load_sensor
 from r3dpa.data import (
     KITTI360DataModule,
     LidarDataModule,
@@ -277,9 +277,9 @@ def folders(tmp_path_factory):
     """Scans of a VLP-16 in two folders."""
     root = tmp_path_factory.mktemp("vlp16")
     for folder, num_scans in (("own", 4), ("simulated", 3)):
+        simulator = Simulator(seed=num_scans, sensor=load_sensor("vlp16", shots=600))
         for number in range(num_scans):
-            points = Simulator(seed=num_scans, sensor="vlp16").scan(number).points
-            write_bin(root / folder / f"{number}.bin", points)
+            write_bin(root / folder / f"{number}.bin", simulator.scan(number).points)
     return root
 
 

@@ -83,11 +83,8 @@ class CircularConv2d(nn.Conv2d):
 
     def forward(self, image: Tensor) -> Tensor:
         """Convolution of ``(B, C, H, W)``."""
-        left, right, _, _ = self.column_pads
-        parts = [image[..., image.shape[-1] - left :]] if left else []
-        parts += [image, image[..., :right]] if right else [image]
-        if len(parts) > 1:  # F.pad gives up the memory format
-            image = torch.cat(parts, dim=-1)
+        if any(self.column_pads):
+            image = F.pad(image, self.column_pads, mode="circular")
         if any(self.extra_row_pads):
             image = F.pad(image, self.extra_row_pads)
         return super().forward(image)
