@@ -66,12 +66,17 @@ def kitti_label(scan: SimulatedScan, sensor_to_world: NDArray[np.float64]) -> st
     )
 
 
+def _turned(angle: float) -> NDArray[np.float64]:
+    """Rotation ``(3, 3)`` about the vertical axis."""
+    cosine, sine = math.cos(angle), math.sin(angle)
+    return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+
+
 def _numbers(
     parts: list[Primitive], scan: SimulatedScan, sensor_to_world: NDArray[np.float64]
 ) -> str:
     yaw = parts[0].yaw_rad  # all parts of a vehicle or a person look the same way
-    turn = np.array([[math.cos(yaw), -math.sin(yaw), 0], [math.sin(yaw), math.cos(yaw), 0]])
-    turn = np.vstack([turn, [0, 0, 1]])
+    turn = _turned(yaw)
     corners = np.concatenate(
         [np.array(part.centre) @ turn + _CORNERS * np.array(part.half_size) for part in parts]
     )
@@ -83,9 +88,9 @@ def _numbers(
     velocity = np.array([*parts[0].velocity_m_s, 0.0]) * ("moving_actors" in moves)
     time_s = 0.0
     for _ in range(_SEARCHES):  # where the object is depends on when the sensor looks there
-        start, heading = motion.moved(time_s)
-        rotation = sensor_to_world[:, :3] @ heading
-        place = sensor_to_world[:, 3] + sensor_to_world[:, :3] @ start
+        ahead_m, aside_m, heading = motion.moved(time_s)
+        rotation = sensor_to_world[:, :3] @ _turned(heading)
+        place = sensor_to_world @ (ahead_m, aside_m, 0, 1)
         x, y, z = (bottom + velocity * time_s - place) @ rotation
         time_s = math.atan2(y, x) / math.tau / scan.sensor.spin_hz
     ahead = turn[:, 0] @ rotation  # of the object, in the sensor frame

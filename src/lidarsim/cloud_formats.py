@@ -30,7 +30,7 @@ _ADVICE = (
 )
 # Share of the points whose intensity may be odd: single returns exceed the full scale of a sensor.
 ODD_SHARE = 1 / 1000
-# Intensities of which fewer exceed 1 are no bytes.
+# Of intensities from 0 to 255 more than this share exceed 1.
 _FEWEST_ABOVE_ONE = 1 / 20
 _MOST_BEAMS, _MOST_COLUMNS = 256, 4096
 _MOST_RATIO = 100  # size of data over size of its file; LZF reaches 88
@@ -94,10 +94,10 @@ def _refuse_devices(path: Path) -> None:
 
 
 def refuse_two_scales(intensity: NDArray, where: str | Path) -> None:
-    """Refuse floats of which most are shares of 1, but too many to be odd values are not.
+    """Refuse floats of which 0.1 to 5 % exceed 1: too many for odd values, too few for bytes.
 
-    Such are raw intensities that have no largest value, as Waymo's; read as bytes they would be
-    255 times too dark.
+    Raw intensities without a largest value, as Waymo's, are such; as bytes they would be 255 times
+    too dark.
     """
     share = np.count_nonzero(intensity > 1) / max(len(intensity), 1)
     if intensity.dtype.kind == "f" and ODD_SHARE < share < _FEWEST_ABOVE_ONE:

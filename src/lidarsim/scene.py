@@ -10,13 +10,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields
 from enum import IntEnum
 from numbers import Integral, Real
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 MAX_INSTANCE = 0xFFFF
 Interval = tuple[float, float]
+Times = TypeVar("Times", float, NDArray[np.float32])
 # Shares of scenes in clear air over a dry and a wet road; and, in the first, of a clear sky.
 _CLEAR_DRY, _CLEAR_WET = 0.85, 0.10
 _CLEAR_SKY = 0.6
@@ -189,13 +190,15 @@ class EgoMotion:
     def __post_init__(self) -> None:
         check_fields(self, "be finite", "speed_m_s", "yaw_rate_rad_s")
 
-    def moved(self, time_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Place ``(3,)`` and axes ``(3, 3)`` of the sensor at a time, in its frame at time 0."""
+    def moved(self, time_s: Times) -> tuple[Times, Times, Times]:
+        """Place x and y and heading at a time, in the sensor's frame at time 0: metres, radians.
+
+        With speed v and yaw rate w: ``v / w * (sin(w t), 1 - cos(w t))`` and ``w t``.
+        """
         angle = self.yaw_rate_rad_s * time_s
-        cosine, sine = math.cos(angle), math.sin(angle)
-        chord = self.speed_m_s * time_s * np.sinc(angle / math.tau)
-        place = chord * np.array([math.cos(angle / 2), math.sin(angle / 2), 0.0])
-        return place, np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+        # sinc(x) = sin(pi x) / (pi x) stands for sin(w t / 2) / (w t / 2): no division by w.
+        chord = self.speed_m_s * time_s * np.sinc(angle / (2 * np.pi))
+        return chord * np.cos(angle / 2), chord * np.sin(angle / 2), angle
 
 
 @dataclass(frozen=True)

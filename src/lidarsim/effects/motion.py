@@ -27,12 +27,9 @@ _ALIKE = 0.94
 class RollingShutter(Effect):
     """Distortion by the motion of the sensor during the sweep; the points are not corrected.
 
-    At time t from the middle of the sweep, with speed v and yaw rate w, a shot starts and points::
-
-        position = v / w * (sin(w t), 1 - cos(w t))        heading = w t
-
-    while the point is stored as if the sensor had stood still. At 50 km/h the two ends of the
-    sweep, which meet behind the car, differ by 1.39 m.
+    Each shot starts and points as the sensor has moved and turned, see
+    :meth:`lidarsim.scene.EgoMotion.moved`, while the point is stored as if it had stood still. At
+    50 km/h the two ends of the sweep, which meet behind the car, differ by 1.39 m.
 
     Source: raw scans of KITTI-360 are not motion-compensated; its development kit "curls" them.
     """
@@ -46,9 +43,7 @@ class RollingShutter(Effect):
 
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
         motion, pose = sweep.scene.motion, sweep.scene.pose
-        angle = np.float32(motion.yaw_rate_rad_s) * sweep.time_s
-        # sinc(x) = sin(pi x) / (pi x) stands for sin(w t / 2) / (w t / 2): no division by w.
-        chord = np.float32(motion.speed_m_s) * sweep.time_s * np.sinc(angle / np.float32(2 * np.pi))
+        ahead, aside, angle = motion.moved(sweep.time_s)
         cosine, sine = np.cos(angle), np.sin(angle)
         origin, direction = (array.reshape(3, -1) for array in sweep.sensor.rays)
 
@@ -58,8 +53,8 @@ class RollingShutter(Effect):
             return np.stack([x, y, vectors[2]])
 
         start = turned(origin)
-        start[0] += chord * np.cos(angle / 2)
-        start[1] += chord * np.sin(angle / 2)
+        start[0] += ahead
+        start[1] += aside
         sweep.start = level(start.astype(np.float32), pose)
         sweep.direction = level(turned(direction), pose)
 
