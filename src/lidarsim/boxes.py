@@ -85,7 +85,8 @@ def _numbers(
     bottom = turn @ np.array([*(low + high)[:2] / 2, low[2]])
     moves = {effect.name for effect in scan.effects if effect.status == "ran"}
     motion = scan.scene.motion if "rolling_shutter" in moves else EgoMotion()
-    velocity = np.array([*parts[0].velocity_m_s, 0.0]) * ("moving_actors" in moves)
+    velocity_m_s = parts[0].velocity_m_s if "moving_actors" in moves else (0.0, 0.0)
+    velocity = np.array([*velocity_m_s, 0.0])
     time_s = 0.0
     for _ in range(_SEARCHES):  # where the object is depends on when the sensor looks there
         ahead_m, aside_m, heading = motion.moved(time_s)

@@ -155,6 +155,18 @@ def test_the_encoder_sees_some_samples_without_intensity_and_some_without_classe
         range_module(2, further_dropout=-1)
 
 
+@pytest.mark.parametrize("stage", ["vae_alignment", "joint"])
+def test_stages_that_train_the_encoder_hide_intensity_and_classes_from_it(stage):
+    vae = VAE(2, 4, 32, (1,), (), 1, stem=(2, 2), intensity=True, num_classes=NUM_CLASSES)
+    weights = LossWeights(vae_alignment=0.0, sit_alignment=0.0)
+    module = STAGES[stage](vae=vae, sit=tiny_sit(), weights=weights, further_dropout=1.0)
+    seen, encode = [], vae.encode
+    vae.encode = lambda image: seen.append(image) or encode(image)
+    train(module, LabelledData(1))
+    assert (seen[0][:, 2:] == -1).all()
+    assert (seen[0][:, :2] != -1).any()
+
+
 def test_the_decoder_learns_what_the_encoder_did_not_see():
     module = train(range_module(2, labelled=True, further_dropout=1.0), LabelledData(20))
     for name in ("intensity", "classes"):

@@ -167,7 +167,7 @@ def _files_of_glob(pattern: Path) -> list[Path]:
     """Files of a glob, with links and hidden files as in :func:`files_below`."""
     parts = (*pattern.parts, "**")
     fixed = Path(*parts[: parts.index("**")])
-    # Path.glob would take hidden folders.
+    # Path.glob, which ruff prefers, also takes hidden folders where a part has a wildcard.
     places = [Path(name) for name in sorted(glob(str(fixed)))]  # noqa: PTH207
     if fixed == pattern:
         return places
