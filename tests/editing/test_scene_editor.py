@@ -22,6 +22,7 @@ from r3dpa.editing.regions import (
     sector_weights,
     token_mask,
 )
+from r3dpa.flow.guidance import FeatureGuidance
 from r3dpa.generation import SamplerConfig, SceneGenerator
 from r3dpa.geometry import (
     NUM_CLASSES,
@@ -230,6 +231,13 @@ class TestMix:
         toward = cosine[..., 0] - cosine[..., 1]
         left = weights[0].bool()
         assert toward[:, left].mean() > toward[:, ~left].mean()
+
+    def test_guidance_that_was_left_out_is_said(self, generator, monkeypatch):
+        monkeypatch.setattr(FeatureGuidance, "num_dropped", 3)
+        sources = [torch.ones(16, 8), torch.eye(8)[0].expand(16, 8)]
+        weights = sector_weights([(0, 0), (180, 1)], (2, 8))
+        with pytest.warns(UserWarning, match="3 gradients of the guidance were not finite"):
+            SceneEditor(generator, EditSettings("heun", 3)).mix(sources, weights, [3])
 
     def test_strength_0_is_the_plain_sampler(self, generator):
         own = SceneEditor(generator, EditSettings("heun", 3, strength=0.0))
