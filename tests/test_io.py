@@ -10,7 +10,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from r3dpa.io import Journal, atomic_path, differences, only_writer, refuse_name
+from r3dpa.io import Journal, atomic_path, differences, only_writer, refuse_name, save_tensors
 
 BAD_NAMES = [
     "../../x",
@@ -145,11 +145,12 @@ def test_an_error_of_a_full_disk_names_the_file(writer, small_disk):
 
     def write():
         tensors = {"a": torch.zeros(1_000_000)}
-        with atomic_path(path) as temporary, temporary.open("wb") as file:
+        if writer == "torch":
+            save_tensors(tensors, path)
+            return
+        with atomic_path(path) as temporary:
             if writer == "bytes":
-                file.write(bytes(2_000_000))
-            elif writer == "torch":
-                torch.save(tensors, file)
+                temporary.write_bytes(bytes(2_000_000))
             else:
                 save_file(tensors, temporary)
 

@@ -57,6 +57,7 @@ __all__ = [
     "one_line",
     "only_writer",
     "refuse_name",
+    "save_tensors",
     "sha256_of",
     "source_commit",
     "text_table",
@@ -99,6 +100,15 @@ def weights_sha256(state: Mapping[str, Tensor], *, ordered: bool = True) -> str:
         values = state[name].detach().cpu().contiguous().flatten().view(torch.uint8)
         digest.update(values.numpy().data)
     return digest.hexdigest()
+
+
+def save_tensors(content: Any, path: str | Path) -> None:
+    """Write what ``torch.load`` reads, atomically; an OSError names the file and the reason."""
+    import torch
+
+    # An open file, since torch.save raises a RuntimeError of its own where it has to open one.
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        torch.save(content, file)
 
 
 @functools.cache

@@ -8,6 +8,7 @@ import yaml
 from resolved_fits import resolved
 
 from r3dpa.ablation import budget_of, make_plan
+from r3dpa.ablation import plan as plan_module
 from r3dpa.ablation.runs import plan_jobs
 from r3dpa.cli.bench import resolve_config
 from r3dpa.cli.features import features_parser, with_data_class
@@ -168,11 +169,58 @@ def test_released_weights_are_sampled_and_measured_as_trained_ones(shipped, tmp_
     assert sampled[sampled.index("--steps") + 1] == "256"
     assert sampled[sampled.index("--solver") + 1] == "euler_maruyama"
     assert sampled[sampled.index("--precision") + 1] == "bf16"
+    assert sampled[sampled.index("--eta") + 1] == "1.0"
     assert test[test.index("--spaces") + 1] == "frid,fld,fsvd,fpvd,fwid,fgeo"
     assert test[test.index("--ckpt.frid") + 1] == "data/weights/frid.ckpt"
 
 
 ROW = {"label": "x", "commands": {"a": "r3dpa fit joint"}}
+
+
+def test_released_weights_are_sampled_without_the_shift_of_a_quality(tmp_path):
+    """`r3dpa sample` shifts times where no shift is given."""
+    settings = {"solver": "ab2", "steps": 32, "shift": 1.0}
+
+    def resolve(words):
+        return {
+            "model": {"class_path": "r3dpa.modules.Joint"},
+            "scorer": {"sampler": settings, "precision": "fp32"},
+        }
+
+    (tmp_path / "t.yaml").write_text(yaml.safe_dump({"caption": "c", "rows": {"a": ROW}}))
+    weights = tmp_path / "weights.pt"
+    weights.write_bytes(b"weights")
+    given = {"tables": tmp_path / "t.yaml", "resolve": resolve, "released": {"a": weights}}
+    (stage,) = rows_of(plan_of("demo", **given))["t", "a"].stages[0]
+    assert stage.words[stage.words.index("--shift") + 1] == "1.0"
+    settings |= {"solver": "euler_maruyama", "sde_last_time": 0.01}
+    with pytest.raises(ValueError, match=r"ends the SDE at 0\.04, but the tests .* at 0\.01"):
+        plan_of("demo", **given)
+
+
+@pytest.mark.parametrize("joint", [" ", "="])
+def test_each_seed_starts_from_its_own_checkpoint(joint, tmp_path):
+    start = f"r3dpa fit flow_matching --model.init_args.init_from{joint}{{vae}}"
+    row = {"label": "x", "commands": {"vae": "r3dpa fit vae_alignment", "flow": start}}
+    table = {"caption": "c", "rows": {"a": row}}
+    (tmp_path / "t.yaml").write_text(yaml.safe_dump(table, sort_keys=False))
+    plan = plan_of("demo", (0, 1), tables=tmp_path / "t.yaml", resolve=words_alone)
+    for vae, flow in rows_of(plan)["t", "a"].stages.values():
+        assert any(str(vae.checkpoint) in word for word in flow.words)
+
+
+def test_a_name_depends_on_the_content_of_weights_in_any_folder(tmp_path):
+    weights = tmp_path / "Gewichte für RGB" / "rgb.pt"
+    weights.parent.mkdir()
+    row = {"label": "x", "commands": {"a": f"r3dpa fit joint --rgb_weights '{weights}'"}}
+    (tmp_path / "t.yaml").write_text(yaml.safe_dump({"caption": "c", "rows": {"a": row}}))
+    names = []
+    for content in (b"one", b"two"):
+        weights.write_bytes(content)
+        plan_module._digest.cache_clear()
+        plan = plan_of("demo", tables=tmp_path / "t.yaml", resolve=words_alone)
+        names.append(plan.stages[0].name)
+    assert names[0] != names[1]
 
 
 @pytest.mark.parametrize(

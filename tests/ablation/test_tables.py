@@ -12,7 +12,7 @@ from tiny_evaluations import evaluation
 from r3dpa.ablation import write_table
 from r3dpa.ablation.plan import Plan, PlannedStage, Row, Table
 from r3dpa.ablation.tables import mean_of_seeds, order_results, relative_change
-from r3dpa.metrics.results import Evaluation, MetricResult
+from r3dpa.metrics.results import Evaluation, EvaluationTable, MetricResult
 
 RECORDED = Path(__file__).resolve().parents[2] / "notebooks" / "results" / "ablation_demo"
 
@@ -26,6 +26,15 @@ def test_a_mean_over_seeds_keeps_notes_and_bad_samples():
     assert mean.row("MMD") is None
     assert mean.bad_samples == ["7"]
     assert mean_of_seeds("row", [evaluation(JSD=1.0)]).row("JSD").interval == (0.9, 1.1)
+
+
+def test_a_table_says_that_the_interval_of_a_mean_is_over_its_trainings():
+    seeds = [evaluation(JSD=1.0), evaluation(JSD=2.0)]
+    seeds[0].about["extra"]["verdict"] = "of the scenes of this seed"
+    mean = mean_of_seeds("row", seeds)
+    table = str(EvaluationTable([mean]))
+    assert "- row: mean of 2 trainings, whose interval is over these" in table
+    assert "verdict" not in mean.about["extra"]
 
 
 def test_released_weights_keep_their_interval_over_scenes(tmp_path):

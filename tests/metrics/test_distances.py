@@ -184,6 +184,23 @@ def test_chamfer_is_the_mean_over_200_real_scans():
     assert row.value == pytest.approx(sum(expected) / 200)
 
 
+def test_chamfer_does_not_depend_on_the_order_of_the_real_scans():
+    """One drive is near the generated scene, the other far away: both count, in either order."""
+    image = torch.full((8, 32), 10.0)
+    drives = {f"drive_{number}": image + 20.0 * number for number in range(2)}
+    values = []
+    for order in (sorted(drives), sorted(drives, reverse=True)):
+        metric = metric_of("mmd")
+        metric.update(image[None], real=False)
+        for drive in order:
+            names = [f"{drive}/{frame}" for frame in range(210)]
+            metric.update(drives[drive].expand(210, -1, -1), real=True, names=names)
+        values.append(metric.results(Resampling(num_resamples=0))[1].value)
+    far = points_of(drives["drive_1"], PROTOCOL.projection)
+    both = chamfer_squared(far, points_of(image, PROTOCOL.projection)) / 2
+    assert values[0] == values[1] == pytest.approx(both, rel=0.2)
+
+
 def test_means_over_real_scans_note_what_their_interval_covers():
     """Means over real scans do not know how other generated scenes would differ."""
     rows = [

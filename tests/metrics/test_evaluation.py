@@ -291,6 +291,13 @@ def test_near_is_one_and_a_half_floors_plus_half_the_interval(value, half_width,
     assert verdict([row], floor_of(1.0), 40) == expected
 
 
+def test_distances_above_a_floor_of_no_distance_are_named():
+    """An unbiased floor of equal scans is below 0 half of the time."""
+    row = MetricResult("X KID", 0.5, interval=(0.45, 0.55))
+    expected = "above it in 1 distance, most in X KID (floor 0)"
+    assert verdict([row], floor_of(-1e-4, "X KID"), 40) == expected
+
+
 @pytest.mark.parametrize(("value", "is_poor"), [(0.41, False), (0.39, True)])
 def test_poor_is_half_the_precision_of_real_scans(value, is_poor):
     row = MetricResult("X recall", value, direction="higher")

@@ -189,6 +189,13 @@ def test_range_net_spaces_standardise_their_input_but_for_lidm(name, range_net):
     torch.testing.assert_close(space([scene]), expected.flatten(1), **FLOAT32)
 
 
+@pytest.mark.parametrize(("name", "size"), [("frid_lidm", (40, 1024)), ("frd", (64, 1800))])
+def test_range_net_spaces_refuse_images_that_their_network_cannot_halve(name, size, range_net):
+    protocol = replace(CENTRE, sensor=LidarSensor(beams=size[0], columns=size[1]))
+    with pytest.raises(ValueError, match=rf"the images are {size[0]} x {size[1]}: leave {name}"):
+        scene_features(name, range_net[2], protocol)
+
+
 def test_remission_is_read_by_networks_of_five_channels(tmp_path):
     torch.manual_seed(0)
     torch.save(RangeNet(21, 5, 0).state_dict(), tmp_path / "weights.pt")

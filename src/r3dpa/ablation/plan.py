@@ -31,11 +31,12 @@ from typing import Any, NamedTuple
 
 import yaml
 
+from r3dpa.flow.sampler import SamplerConfig, settings_of
 from r3dpa.io import sha256_of
 from r3dpa.metrics.results import PUBLISHED_SCALES
 
 _NAME = re.compile(r"{(\w+)}")
-_WEIGHTS = re.compile(r'"([^"]+\.(?:pt|pth|ckpt|safetensors))"')
+_WEIGHTS = re.compile(r'"[^"]+\.(?:pt|pth|ckpt|safetensors)"')
 _SEEDS = ("seed_everything", "model.init_args.seed", "data.init_args.seed", "scorer.seed")
 _NOT_TRAINED = ("scorer", "run_dir", "ckpt_path")  # keys that do not change a training
 _PARTS_OF_SCALE = ("options", "config", "stages", "tables", "commands", "reference")
@@ -252,7 +253,8 @@ class _Planner:
         # Wherever the folder is, and whether the stages in it are trained or not.
         place = json.dumps(f"{self.out}/").removesuffix('"')
         text = json.dumps(trained, sort_keys=True).replace(place, '"{out}/')
-        files = [_digest(path) for path in map(Path, _WEIGHTS.findall(text)) if path.is_file()]
+        named = [Path(json.loads(name)) for name in _WEIGHTS.findall(text)]
+        files = [_digest(path) for path in named if path.is_file()]
         digest = hashlib.sha256(json.dumps([text, files]).encode()).hexdigest()[:10]
         name = f"{words[0]}-{digest}"
         return PlannedStage(
@@ -271,12 +273,18 @@ def _with_seed(chain: Sequence[PlannedStage], seed: int, out: Path) -> list[Plan
         stage._replace(
             name=names[stage.name],
             folder=out / "stages" / names[stage.name],
-            words=[checkpoints.get(word, word) for word in stage.words]
+            words=[_replace_all(word, checkpoints) for word in stage.words]
             + (_seed_words(seed) if stage.on_scans else []),
             before=tuple(names[name] for name in stage.before),
         )
         for stage in chain
     ]
+
+
+def _replace_all(text: str, replacements: Mapping[str, str]) -> str:
+    for old, new in replacements.items():
+        text = text.replace(old, new)
+    return text
 
 
 def _seed_words(seed: int) -> list[str]:
@@ -288,10 +296,16 @@ def _sampling_of(chain: Sequence[PlannedStage]) -> list[str]:
     if not chain or chain[-1].config["model"]["class_path"].startswith("r3dpa.baselines"):
         return []
     scorer = chain[-1].config["scorer"]
-    options = {name: scorer["sampler"][name] for name in ("solver", "steps")}
-    options["precision"] = scorer["precision"]
-    if scorer["sampler"]["shift"] != 1:
-        options["shift"] = scorer["sampler"]["shift"]
+    sampler = SamplerConfig(**scorer["sampler"])
+    options = {"solver": sampler.solver, "steps": sampler.steps, "precision": scorer["precision"]}
+    # Even where they are defaults: `r3dpa sample` starts from those of a quality.
+    options |= {name: getattr(sampler, name) for name in settings_of(sampler.solver)}
+    if options.pop("sde_last_time", SamplerConfig.sde_last_time) != SamplerConfig.sde_last_time:
+        raise ValueError(
+            f"released weights are sampled by `r3dpa sample`, which ends the SDE at "
+            f"{SamplerConfig.sde_last_time}, but the tests of this scale at "
+            f"{sampler.sde_last_time}: leave sde_last_time out of scorer.sampler"
+        )
     return [word for name, value in options.items() for word in (f"--{name}", str(value))]
 
 

@@ -73,6 +73,8 @@ def mean_of_seeds(label: str, evaluations: Sequence[Evaluation]) -> Evaluation:
         rows.append(replace(row, value=mean, interval=interval, note="; ".join(notes)))
     bad = [name for e in evaluations for name in e.bad_samples]
     extra = first.about["extra"] | {"bad_samples": bad, "seeds": len(evaluations)}
+    for remark in ("verdict", "warning"):  # of the scenes of one seed
+        extra.pop(remark, None)
     return Evaluation(label, tuple(rows), first.about | {"seed": None, "extra": extra})
 
 

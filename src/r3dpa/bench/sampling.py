@@ -30,7 +30,7 @@ from r3dpa.checkpoints import read_checkpoint
 from r3dpa.flow.average_velocity import AVERAGE_STEPS
 from r3dpa.flow.sampler import SamplerConfig, Solver
 from r3dpa.flow.solvers import steps_for
-from r3dpa.io import atomic_path, command, machine, usable_device, versions
+from r3dpa.io import command, machine, save_tensors, usable_device, versions
 
 #: Solvers with the shift of their grids.
 _SOLVERS: tuple[tuple[Solver, float], ...] = (
@@ -87,8 +87,7 @@ class Work:
         path = self.folder / f"{name}.pt"
         if not path.exists():
             value = make()
-            with atomic_path(path) as temporary:
-                torch.save(value, temporary)
+            save_tensors(value, path)
         return torch.load(path, weights_only=True)
 
 
@@ -123,16 +122,21 @@ def sampling(
     if quick:
         usual = Effort(8, 200, _EVALUATIONS[1:-3], 3, batch)
     chosen = replace(usual, **{k: v for k, v in (effort or {}).items() if v is not None})
+    if chosen.reference_steps < 2:
+        raise ValueError(
+            f"reference_steps must be at least 2, got {chosen.reference_steps}: the solution in "
+            "half the steps says how exact the reference is"
+        )
     work, model, ways, about = Work(), None, [], {}
     if ckpt is not None:  # wrong files and options are refused before anything is measured
         checkpoint = read_checkpoint(ckpt)
         about = {"file": checkpoint.path.name, "stage": checkpoint.stage, "step": checkpoint.step}
         model = ModelProblem(checkpoint, device, chosen.batch)
         request = [about, checkpoint.path.stat().st_mtime_ns, str(chosen), device, quick]
-        work = Work(out / "work", request)
         ways = settings_of(chosen, ("bf16", "fp32") if kind == "cuda" else ("fp32", "bf16"))
         if checkpoint.stage == "few_step":
             ways += few_step_settings(ways[0], "thin_decoder" in checkpoint.networks)
+        work = Work(out / "work", request)
     toy = _TOY_QUICK if quick else _TOY
     mixture = MixtureProblem(toy_mixture(), toy.samples, toy.batch)
     problems = {"mixture": run_problem(mixture, settings_of(toy), toy)}

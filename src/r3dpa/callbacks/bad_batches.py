@@ -14,7 +14,7 @@ import torch
 from lightning import LightningModule
 from torch import Tensor
 
-from r3dpa.io import atomic_path
+from r3dpa.io import save_tensors
 from r3dpa.modules import GenerativeModule
 from r3dpa.modules.stage import PathDraws
 
@@ -41,8 +41,7 @@ def save_bad_batch(
         "draws": {key: value.cpu() for key, value in draws._asdict().items()},
     }
     path = folder / f"step_{module.global_step:07d}_batch_{number:07d}_rank_{module.global_rank}.pt"
-    with atomic_path(path) as temporary:
-        torch.save(content, temporary)
+    save_tensors(content, path)
     return path
 
 

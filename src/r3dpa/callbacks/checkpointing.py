@@ -14,7 +14,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.utilities import rank_zero_info
 
 from r3dpa.callbacks.step_guard import StepGuard
-from r3dpa.io import atomic_path
+from r3dpa.io import save_tensors
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
@@ -28,9 +28,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any | None = None
     ) -> None:
         """Write a checkpoint; an OSError names the file and the reason."""
-        # A file object: torch's own errors do not name the reason.
-        with atomic_path(path) as temporary, temporary.open("wb") as file:
-            torch.save(checkpoint, file)
+        save_tensors(checkpoint, path)
 
 
 class RunCheckpoint(ModelCheckpoint):

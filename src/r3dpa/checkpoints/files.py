@@ -35,6 +35,7 @@ from r3dpa.io import (
     UNPICKLING_ERRORS,
     atomic_path,
     first_line,
+    save_tensors,
     sha256_of,
     source_commit,
     text_table,
@@ -236,8 +237,7 @@ def _save_official(checkpoint: Checkpoint, out: Path, overwrite: bool) -> list[P
         )
     _refuse_existing(list(files), overwrite)
     for path, weights in files.items():
-        with atomic_path(path) as temporary:
-            torch.save(weights, temporary)
+        save_tensors(weights, path)
     return list(files)
 
 

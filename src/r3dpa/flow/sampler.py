@@ -26,7 +26,7 @@ SDELast = Literal["denoise", "mean"]
 _SETTINGS = ("shift", "eta", "sde_last", "sde_last_time")
 
 
-def _settings_of(solver: str) -> tuple[str, ...]:
+def settings_of(solver: str) -> tuple[str, ...]:
     """Settings that a solver reads, beside its steps."""
     others: dict[str, tuple[str, ...]] = {
         "euler_maruyama": ("eta", "sde_last", "sde_last_time"),
@@ -91,10 +91,10 @@ class SamplerConfig:
                 f"average_velocity takes {', '.join(map(str, AVERAGE_STEPS))} steps, as "
                 f"stage few_step trains them, got {self.steps}"
             )
-        read = _settings_of(self.solver)
+        read = settings_of(self.solver)
         for name in _SETTINGS:
             if name not in read and getattr(self, name) != getattr(type(self), name):
-                readers = [k for k in get_args(Solver) if name in _settings_of(k)]
+                readers = [k for k in get_args(Solver) if name in settings_of(k)]
                 raise ValueError(
                     f"solver {self.solver} does not read {name}, which is for "
                     f"{', '.join(readers)}; drop one"
@@ -117,7 +117,7 @@ class SamplerConfig:
     def changed(self, **settings: Any) -> Self:
         """This sampler with other settings; another solver keeps the settings that it reads."""
         solver = settings.get("solver", self.solver)
-        read = ("steps", *_settings_of(solver))
+        read = ("steps", *settings_of(solver))
         kept = {name: getattr(self, name) for name in read}
         return type(self)(**{"solver": solver, **kept, **settings})
 

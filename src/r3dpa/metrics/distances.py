@@ -28,7 +28,7 @@ from r3dpa.metrics.functional_bev import (
     point_histogram,
 )
 from r3dpa.metrics.resampling import Resampling
-from r3dpa.metrics.results import MetricResult
+from r3dpa.metrics.results import PUBLISHED_SCALES, MetricResult
 from r3dpa.metrics.scene import Protocol
 
 #: Width of the bins of ranges, metres.
@@ -37,8 +37,6 @@ SIDES = ("real", "generated")
 #: Note of a mean over real scans, whose interval says nothing about other generated scenes.
 OVER_REAL_SCANS = "interval over draws of the real scans, generated scenes fixed"
 
-#: Powers of ten that the published table prints its columns in.
-_SCALES = {"FLD": -1, "JSD": -2, "MMD": -5}
 _CHAMFER_PAIRS = 200  # real scans that the 3D Chamfer distance is averaged over
 _PRUNING_SLACK = 64  # scenes beyond twice the limit before a state is cut down to the limit
 
@@ -195,7 +193,7 @@ class SceneMetric(Metric):
     ) -> MetricResult:
         """Row of a number over ``counts`` generated and real scenes, by default all."""
         generated, real = counts or (self.count("generated"), self.count("real") or None)
-        scale = _SCALES.get(name.removesuffix(" inf"), 0)
+        scale = PUBLISHED_SCALES.get(name.removesuffix(" inf"), 0)
         return MetricResult(
             name, value, scale=scale, num_samples=generated, num_references=real, **fields
         )
@@ -375,7 +373,8 @@ class MinimumMatchingDistance(_ImageMetric):
     """Published "MMD" on occupied cells seen from above, and 3D Chamfer distance of its matches.
 
     Points beyond the grid do not count in MMD, by its definition. The 3D distance, in square
-    metres, is the mean over up to 200 real scans, each with the nearest generated scene by cells.
+    metres, is the mean over up to 200 real scans, each with the nearest generated scene by cells:
+    the scans whose names have the lowest hashes, so that all drives take part.
 
     Attributes:
         reference_cells: Occupied cells ``(n,)`` of real scans without images, as in the official
@@ -414,12 +413,13 @@ class MinimumMatchingDistance(_ImageMetric):
         return rows
 
     def _chamfer(self, matching: Matching) -> Tensor:
-        """Chamfer distance ``(R,)`` of the first real scans to their nearest generated scenes."""
-        nearest = matching.nearest[:_CHAMFER_PAIRS]
+        """Chamfer distance ``(R,)`` of some real scans to their nearest generated scenes."""
         real, generated = self.subset("real")[1], self.subset("generated")[1]
+        chosen = self.lowest("real", _CHAMFER_PAIRS)
+        nearest = matching.nearest.to(chosen.device)[chosen]
         pairs = zip(
-            self.points_of_images(real[: len(nearest)]),
-            self.points_of_images(generated[nearest.to(generated.device)]),
+            self.points_of_images(real[chosen]),
+            self.points_of_images(generated[nearest]),
             strict=True,
         )
         return torch.tensor([chamfer_squared(*pair) for pair in pairs], dtype=torch.float64)

@@ -6,6 +6,7 @@ The floor of a metric is its value between the halves of the reference, see
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -144,8 +145,9 @@ def verdict(rows: Sequence[MetricResult], floors: Floors, num_scenes: int) -> st
         if row.direction == "lower":
             if row.value <= NEAR_FLOOR * max(floor.value, 0.0) + row.half_width:
                 near.append(row.name)
-            elif floor.value > 0:
-                far.append((row.value / floor.value, row.name))
+            else:  # unbiased estimates between scans may be below 0
+                ratio = row.value / floor.value if floor.value > 0 else math.inf
+                far.append((ratio, row.name))
         elif row.name.endswith(_SHARES) and row.value < POOR_SHARE * floor.value:
             poor.append(f"{row.name} {row.value:.2g} (real scans {floor.value:.2g})")
     near_text = f"near the floor in {', '.join(near)}"
@@ -154,7 +156,10 @@ def verdict(rows: Sequence[MetricResult], floors: Floors, num_scenes: int) -> st
         return f"{text}, though {near_text}" if near else text
     parts = [near_text] if near else []
     if far:
-        worst = [f"{name} ({ratio:.3g} x)" for ratio, name in sorted(far, reverse=True)[:3]]
+        worst = [
+            f"{name} ({ratio:.3g} x)" if ratio < math.inf else f"{name} (floor 0)"
+            for ratio, name in sorted(far, reverse=True)[:3]
+        ]
         plural = "" if len(far) == 1 else "s"
         parts.append(f"above it in {len(far)} distance{plural}, most in {', '.join(worst)}")
     return "; ".join(parts) or "no floors to compare with"

@@ -292,7 +292,12 @@ class EvaluationTable:
         table = text_table(self._lines(cell), ["", *heads], "l" + "r" * len(heads), "pipe")
         marks = "**best**, _second_, = tie: no further apart than the floor or the intervals"
         interval = f"[low, high]: {_INTERVAL} (MMD: real scans drawn, generated scenes fixed)"
-        below = [f"- {text}" for text in (marks, interval, *self.notes)]
+        seeds = [
+            f"{e.name}: mean of {e.about['extra']['seeds']} trainings, whose interval is over these"
+            for e in self.evaluations
+            if "seeds" in e.about["extra"]
+        ]
+        below = [f"- {text}" for text in (marks, interval, *seeds, *self.notes)]
         return "\n".join([table, "", *below]) + "\n"
 
     def latex(self) -> str:

@@ -153,7 +153,17 @@ def range_net_space(name: str, network: RangeNet, protocol: Protocol) -> SceneFe
 
     LiDM feeds metres, -1 where a pixel is empty, on the corners of pixels; the others standardise
     the channels, 0 where empty, with constants that differ between archives.
+
+    Raises:
+        ValueError: If the network cannot halve the columns of the sensor five times, or its rings
+            do not fill 16 equal bands.
     """
+    beams, columns = protocol.sensor.beams, protocol.sensor.columns
+    if columns % 32 or (name != "frd" and beams % NUM_BANDS):
+        raise ValueError(
+            f"{name} needs a multiple of 32 columns, and of {NUM_BANDS} rings for its bands, but "
+            f"the images are {beams} x {columns}: leave {name} out of the spaces"
+        )
     device, raw = network.image_mean.device, name == "frid_lidm"
     corner = raw or protocol.unprojection == "corner"
 

@@ -30,7 +30,6 @@ from r3dpa.nn.velocity_network import (
     TIME_WIDTH,
     Float32Linear,
     VelocityNetwork,
-    VelocityOutput,
     time_frequencies,
 )
 
@@ -181,19 +180,6 @@ class SiT(VelocityNetwork):
             )
         self.final_layer = _FinalLayer(hidden_size, math.prod(patch) * in_channels)
 
-    def forward(
-        self, latents: Tensor, time: Tensor, labels: Tensor | None = None
-    ) -> VelocityOutput:
-        """Velocity ``(B, C, h, w)`` and projected features ``(B, N, F)``, from one pass."""
-        self._check(latents, time)
-        modulations = self.modulations(time, labels)
-        tokens = self.embed(latents)
-        aligned = self.run_blocks(self.blocks[: self.alignment_depth], tokens, modulations)
-        later = self._later_modulations(modulations)
-        tokens = self.run_blocks(self.blocks[self.alignment_depth :], aligned, later)
-        velocity = self.output(self.final_layer, tokens, modulations)
-        return VelocityOutput(velocity, self.projector(aligned))
-
     def modulations(self, time: Tensor, labels: Tensor | None = None) -> Tensor:
         """Shifts, scales and gates ``(T, M)``: six vectors per block, then two for the output."""
         return modulations_of([*self.blocks, self.final_layer], self.conditioning(time, labels))
@@ -248,8 +234,6 @@ class SiT(VelocityNetwork):
             block.get_submodule("mlp").bfloat16()
         return self
 
-    # Parts of the forward pass, for evaluations that need only one of its results
-
     def _begin(self, latents: Tensor, modulations: Tensor) -> tuple[Tensor, ...]:
         first = self.blocks[: self.alignment_depth]
         return (self.run_blocks(first, self.embed(latents), modulations),)
@@ -259,17 +243,13 @@ class SiT(VelocityNetwork):
 
     def _finish(self, activations: tuple[Tensor, ...], modulations: Tensor) -> Tensor:
         (tokens,) = activations
-        later = self._later_modulations(modulations)
+        later = modulations[:, 6 * self.hidden_size * self.alignment_depth :]
         tokens = self.run_blocks(self.blocks[self.alignment_depth :], tokens, later)
         return self.output(self.final_layer, tokens, modulations)
 
     def _first_modulations(self, time: Tensor, labels: Tensor | None) -> Tensor:
         first = self.blocks[: self.alignment_depth]
         return modulations_of(first, self.conditioning(time, labels))
-
-    def _later_modulations(self, modulations: Tensor) -> Tensor:
-        """Modulations of the layers behind the aligned depth."""
-        return modulations[:, 6 * self.hidden_size * self.alignment_depth :]
 
 
 def modulations_of(layers: Iterable[nn.Module], conditioning: Tensor) -> Tensor:
