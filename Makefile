@@ -42,8 +42,6 @@ FIT_SECOND := OMP_NUM_THREADS=1 nice -n 19 $(BIN)/r3dpa fit --config conf/traine
 SCANS ?= 8000
 FROM ?= r3dpa-s
 SECOND_DATA := --config conf/r3dpa_s_2/data.yaml --data.init_args.num_scans $(SCANS)
-FIT_PERCEPTUAL := $(FIT_SECOND) $(SECOND_DATA) --config conf/r3dpa_s_2/vae_alignment.yaml \
-	--config conf/r3dpa_s_2/decoder_labels.yaml --config conf/r3dpa_s_2/perceptual.yaml
 SECOND_ALIGNED := $(SECOND_DATA) --config conf/r3dpa_s_2/teacher.yaml
 FIT_FIRST := nice -n 19 $(BIN)/r3dpa fit --config conf/trainer.yaml --config conf/r3dpa_s/trainer.yaml \
 	--config conf/r3dpa_s/data.yaml --ckpt_path last
@@ -187,25 +185,20 @@ r3dpa-s: $(READY) ## train the second edition of r3dpa-s: 20 hours of a core; st
 	$(BIN)/r3dpa data objects --data conf/r3dpa_s_2/data.yaml --ckpt $(SECOND)/r3dpa-s.safetensors \
 		--out $(SECOND)/r3dpa-s.objects
 
-r3dpa-s-more: $(READY) ## train weights on, in six hours of a core: labels, alignment, few steps [FROM=r3dpa-s]
+r3dpa-s-more: $(READY) ## train weights on, in six hours of a core: encoder, decoder, SiT, few steps [FROM=r3dpa-s]
 	OMP_NUM_THREADS=1 nice -n 19 $(BIN)/r3dpa data prepare $(SECOND_ALIGNED)
 	$(FIT_SECOND) $(SECOND_DATA) --config conf/r3dpa_s_2/vae_alignment.yaml \
-		--config conf/r3dpa_s_2/decoder_labels.yaml --run_dir $(SECOND)/labels \
+		--config conf/r3dpa_s_2/encoder.yaml --run_dir $(SECOND)/encoder \
 		--model.init_args.init_from '$(FROM)'
-	$(FIT_PERCEPTUAL) --run_dir $(SECOND)/perceptual \
-		--model.init_args.init_from $(SECOND)/labels/checkpoints/last.ckpt
-	$(BIN)/r3dpa convert $(SECOND)/labels/checkpoints/last.ckpt $(SECOND)/mean.safetensors --overwrite \
-		--decoder $(SECOND)/perceptual/checkpoints/last.ckpt --decoder_share 0.5
-	$(FIT_PERCEPTUAL) --run_dir $(SECOND)/perceptual_2 --model.init_args.weights.perceptual 0.0005 \
-		--trainer.max_steps 450 --model.init_args.init_from $(SECOND)/mean.safetensors
+	$(FIT_SECOND) $(SECOND_DATA) --config conf/r3dpa_s_2/vae_alignment.yaml \
+		--config conf/r3dpa_s_2/decoder_labels.yaml --config conf/r3dpa_s_2/perceptual.yaml \
+		--run_dir $(SECOND)/perceptual --model.init_args.init_from $(SECOND)/encoder/checkpoints/last.ckpt
 	$(FIT_SECOND) $(SECOND_ALIGNED) --config conf/r3dpa_s_2/flow_matching.yaml \
 		--config conf/r3dpa_s_2/aligned.yaml --run_dir $(SECOND)/aligned \
-		--model.init_args.init_from $(SECOND)/perceptual_2/checkpoints/last.ckpt
-	$(BIN)/r3dpa convert '$(FROM)' $(SECOND)/with_few_steps.safetensors --overwrite \
-		--flow $(SECOND)/aligned/checkpoints/last.ckpt --decoder $(SECOND)/perceptual_2/checkpoints/last.ckpt
+		--model.init_args.init_from $(SECOND)/perceptual/checkpoints/last.ckpt
 	$(FIT_SECOND) $(SECOND_ALIGNED) --config conf/r3dpa_s_2/flow_matching.yaml \
-		--config conf/r3dpa_s_2/few_step.yaml --model.init_args.vae.init_args.encode_further false \
-		--run_dir $(SECOND)/aligned_few_step --model.init_args.init_from $(SECOND)/with_few_steps.safetensors
+		--config conf/r3dpa_s_2/few_step.yaml --run_dir $(SECOND)/aligned_few_step \
+		--model.init_args.init_from $(SECOND)/aligned/checkpoints/last.ckpt
 	$(BIN)/r3dpa convert $(SECOND)/aligned_few_step/checkpoints/last.ckpt $(SECOND)/more.safetensors \
 		--networks vae ema ema_latent_norm --half --overwrite
 

@@ -50,14 +50,15 @@ def test_a_stage_may_have_made_its_flow_of_the_averages(shipped):
 def test_a_stem_of_fewer_rows_makes_the_same_latents_of_a_coarser_image(shipped):
     networks = networks_for(shipped, (2, 8), (8, 64))
     before, rows = resize_to(networks, _without_average(shipped), shipped)
-    layers = "vae: encoder.conv_in, decoder.conv_out, decoder.further_out"
+    layers = "vae: encoder.conv_in, encoder.further_in, decoder.conv_out, decoder.further_out"
     layers += ", decoder.further_refinement.features"
     assert results(rows) == {layers: "resized", "sit: average": "dropped"}
     load_into(networks, before, "test")
     full = shipped.network("vae").build()
     smooth = torch.linspace(-0.2, 0.4, 64)[:, None].expand(64, 1024)
-    image = torch.stack([smooth, torch.ones(64, 1024)])[None]
-    coarse = image.view(1, 2, 32, 2, 1024).mean(dim=3)
+    returns, intensity, classes = (torch.full((64, 1024), value) for value in (1.0, -0.5, 3.0))
+    image = torch.stack([smooth, returns, intensity, classes])[None]
+    coarse = image.view(1, 4, 32, 2, 1024).mean(dim=3)
     with torch.no_grad():
         latents = full.encode(image).mean
         theirs = networks["vae"].encode(coarse).mean

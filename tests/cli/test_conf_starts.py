@@ -229,8 +229,6 @@ def test_the_second_edition_of_r3dpa_s_starts(name, start, tmp_path):
     if name.startswith("vae"):
         later = ("intensity", "num_classes", "refinement")
         vae = {key: value for key, value in vae.items() if key not in later}
-    if name in ("decoder_labels", "perceptual", "aligned"):
-        vae["encode_further"] = False
     channels = {} if name.startswith("vae") else {"intensity_channel": True, "num_classes": 15}
     codec = RangeCodec("log2", return_channel=True, **channels)
     settings |= start_flow(tmp_path, vae, (16, 64), sit, codec)

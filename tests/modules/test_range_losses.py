@@ -243,14 +243,27 @@ def test_a_run_of_ranges_starts_from_a_checkpoint_whose_decoder_has_labels(tmp_p
     assert all(torch.equal(value, expected[key]) for key, value in module.vae.state_dict().items())
 
 
-def test_what_an_encoder_has_learned_of_intensity_and_class_is_not_left_out():
+@pytest.mark.parametrize(
+    ("there", "here"),
+    [(LABELS, {}), (LABELS, DECODED), (LABELS | {"intensity": False}, {})],
+    ids=["labels to ranges", "labels to the decoder alone", "classes to ranges"],
+)
+def test_an_encoder_without_intensity_and_class_gives_the_latents_of_unknown_ones(there, here):
     arguments = {"in_channels": 2, "channels": 32, "channel_multipliers": (1,), "strides": ()}
-    before = VAE(**arguments, **LABELS)
-    given = vae_checkpoint(before, arguments | LABELS, LabelledData.codec)
-    after = VAE(**arguments)
-    assert without_further_channels(given, after) is given
-    with pytest.raises(ValueError, match=r"encoder\.further_in"):
-        load_into({"vae": after}, given, stage="joint")
+    arguments["stem"] = (2, 2)
+    before, after = (VAE(**arguments, **further) for further in (there, here))
+    for values in before.encoder.further_in.parameters():
+        torch.nn.init.normal_(values)
+    given = vae_checkpoint(before, arguments | there, LabelledData.codec)
+    load_into({"vae": after}, without_further_channels(given, after), stage="joint")
+    image = torch.rand(1, 4, 8, 16)
+    image[:, 2], image[:, 3] = -1, UNKNOWN_CLASS
+    seen = image if there["intensity"] else image[:, [0, 1, 3]]
+    with torch.no_grad():
+        expected = before.encode(seen).mean
+        torch.testing.assert_close(after.encode(image[:, :2]).mean, expected)
+        if here:
+            assert torch.equal(after.predict(expected), before.predict(expected))
 
 
 @pytest.mark.parametrize("further", [LABELS, {}], ids=["labels", "ranges"])
@@ -273,9 +286,12 @@ def test_the_shipped_weights_start_a_vae_with_and_without_intensity_and_class(fu
     assert recorded.codec == (LabelledData if further else RangeData).codec
     assert module.latent_norm.fitted
     image = torch.rand(1, 4, 16, 64)
+    if not further:
+        image[:, 2], image[:, 3] = -1, UNKNOWN_CLASS
     with torch.no_grad():
         latents = before.encode(image).mean
-        assert torch.equal(module.vae.encode(image[:, : 4 if further else 2]).mean, latents)
+        found = module.vae.encode(image[:, : 4 if further else 2]).mean
+        torch.testing.assert_close(found, latents)
         assert torch.equal(module.vae.predict(latents)[:, :6], before.predict(latents)[:, :6])
 
 

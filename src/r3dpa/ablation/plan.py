@@ -298,7 +298,7 @@ def _sampling_of(chain: Sequence[PlannedStage]) -> list[str]:
     scorer = chain[-1].config["scorer"]
     sampler = SamplerConfig(**scorer["sampler"])
     options = {"solver": sampler.solver, "steps": sampler.steps, "precision": scorer["precision"]}
-    # Even where they are defaults: `r3dpa sample` starts from those of a quality.
+    # Even where they are defaults: `r3dpa sample` starts from the settings of a quality.
     options |= {name: getattr(sampler, name) for name in settings_of(sampler.solver)}
     if options.pop("sde_last_time", SamplerConfig.sde_last_time) != SamplerConfig.sde_last_time:
         raise ValueError(

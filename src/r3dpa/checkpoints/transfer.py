@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 from torch import Tensor
 
 from r3dpa.checkpoints.files import read_checkpoint
-from r3dpa.checkpoints.networks import Checkpoint, load_into, shapes_of
+from r3dpa.checkpoints.networks import Checkpoint, NetworkState, load_into, shapes_of
 from r3dpa.io import weights_sha256
 from r3dpa.nn import VAE, LatentNorm, SiT, VelocityNetwork
 
@@ -22,6 +22,7 @@ Result = Literal["kept", "fresh", "resized", "truncated", "dropped"]
 NORM_TOLERANCE = 0.05
 _NORM = "latent_norm."
 _PROJECTOR = "projector."
+_FURTHER_INPUT, _FIRST_BIAS = "encoder.further_in", "encoder.conv_in.bias"
 _REFINEMENT = "further_refinement."
 
 
@@ -116,17 +117,36 @@ def with_further_channels(checkpoint: Checkpoint, vae: VAE) -> Checkpoint:
 def without_further_channels(checkpoint: Checkpoint, vae: VAE) -> Checkpoint:
     """Checkpoint whose VAE has no refinement, intensity and class that ``vae`` lacks.
 
-    All else stays. Intensity and class are left out together, and stay where the encoder sees them:
-    without, its latents would be others.
+    All else stays; intensity and class are left out together. An encoder that saw them becomes one
+    that gives the latents of images in which neither is known.
     """
     if not vae.refinement:
         checkpoint = _without_refinement(checkpoint)
-    weights = checkpoint.network("vae").state_dict
-    rest = {key: value for key, value in weights.items() if ".further_" not in key}
-    encoded = any(key.startswith("encoder.further_") for key in weights)
-    if vae.image_channels > vae.in_channels or len(rest) == len(weights) or encoded:
+    state = checkpoint.network("vae")
+    weights, has_further = state.state_dict, vae.image_channels > vae.in_channels
+    if not (has_further and vae.encode_further):
+        weights = _without_further_input(state)
+    if not has_further:
+        weights = {key: value for key, value in weights.items() if ".further_" not in key}
+    if len(weights) == len(state.state_dict):
         return checkpoint
-    return _with_channels_of(checkpoint, vae, rest)
+    return _with_channels_of(checkpoint, vae, weights)
+
+
+def _without_further_input(state: NetworkState) -> Weights:
+    """Weights of a VAE whose encoder sees range and return alone.
+
+    What the encoder adds for an intensity of -1 and no class, which stand for unknown, is the same
+    everywhere: it moves into the bias of the first layer.
+    """
+    weights = dict(state.state_dict)
+    if f"{_FURTHER_INPUT}.weight" not in weights:
+        return weights
+    kernel, added = (weights.pop(f"{_FURTHER_INPUT}.{name}").float() for name in ("weight", "bias"))
+    if state.arguments["intensity"]:
+        added = added - kernel[:, : math.prod(state.arguments["stem"])].sum(dim=(1, 2, 3))
+    weights[_FIRST_BIAS] = weights[_FIRST_BIAS] + added
+    return weights
 
 
 def _without_refinement(checkpoint: Checkpoint) -> Checkpoint:
