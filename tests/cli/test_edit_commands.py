@@ -313,6 +313,11 @@ REFUSED = [
     ),
     ("complete", "", "nothing is missing"),
     ("complete", "--keep_every 1", "2 to 8, got 1"),
+    ("complete", "--keep_every 2 --start 3", "start must be a time above 0 .* got 3"),
+    ("inpaint", "--mask m.png --start 0", "start must be a time above 0 .* got 0"),
+    ("inpaint", "--mask m.png --dilation -1", "dilation must be 0 or greater, got -1"),
+    ("inpaint", "--mask m.png --dilation 99", "tokens with any of their .* pixels selected"),
+    ("vary", "--start 2", "start must be a time above 0 .* got 2"),
     ("vary", "--device tpu", "device 'tpu' cannot be used here"),
     ("vary", "--scan tilted.bin", r"tilted.bin: .*outside the field"),
     ("vary", "--scan two.npz", "must hold one scan.*its arrays are x, y"),
@@ -331,6 +336,13 @@ def test_bad_input_is_refused_before_networks_run(
     with pytest.raises(ValueError, match=message):
         edit(files, command, tmp_path / "out", *scan, *more.split())
     assert not (tmp_path / "out").exists()
+    # Nor has --overwrite taken away what an earlier edit wrote.
+    earlier = tmp_path / "earlier"
+    earlier.mkdir()
+    (earlier / "metadata.json").write_text('{"num": 1, "nfe": 1}')
+    with pytest.raises(ValueError, match=message):
+        edit(files, command, earlier, *scan, "--overwrite", *more.split())
+    assert [path.name for path in earlier.iterdir()] == ["metadata.json"]
 
 
 @pytest.mark.usefixtures("no_sheet")

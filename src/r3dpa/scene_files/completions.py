@@ -24,6 +24,7 @@ from r3dpa.editing import EditResult
 from r3dpa.editing.editor import COMPLETION_START
 from r3dpa.editing.gaps import interpolate_gaps, range_error_m, unseen_pixels
 from r3dpa.editing.regions import check_mask, dropped_beams, sector, sensor_pair
+from r3dpa.editing.settings import check_start
 from r3dpa.geometry import (
     Pixels,
     Projection,
@@ -156,8 +157,10 @@ def complete_files(
     refuse_folder_of_scans(options.out, root, len(paths))
     session = _session(options, num)
     stage = session.checkpoint.stage
-    if job.start is not None and session.baseline is not None:
-        raise ValueError(f"--start is for R3DPA: stage {stage} starts from noise")
+    if job.start is not None:
+        check_start(job.start)
+        if session.baseline is not None:
+            raise ValueError(f"--start is for R3DPA: stage {stage} starts from noise")
     if job.resamplings is not None and stage not in ("r2dm", "r2flow"):
         raise ValueError(f"--resamplings is for R2DM and R2Flow, not for stage {stage}")
     threads = None if workers == 1 else max(1, (os.cpu_count() or 1) // workers)
