@@ -119,6 +119,8 @@ class CompletionJob:
         view = session.view(path, cloud)
         missing = self.missing.find(view.pixels.range_m, session)
         session.check(view, missing)
+        if session.baseline is not None:
+            session.baseline.known_latents(~missing)  # refuses what it could read nothing of
         return cloud, view, missing
 
     def __call__(self, path: Path) -> Completion:
