@@ -269,6 +269,18 @@ class TestComplete:
             assert np.array_equal(written[: len(rows)], labels)
             assert not written[len(rows) :].any()
 
+    def test_generated_points_have_intensities_of_the_scan(self, files, tmp_path):
+        """A model knows those of its own sensor; the scan is of one that sees everything dim."""
+        labelled_checkpoint(tmp_path)
+        points = read_scan(files / "a.bin")
+        points[:, 3] = 0.02
+        write_bin(tmp_path / "dim.bin", points)
+        words = ["--scan", tmp_path / "dim.bin", "--sector", -90, 90]
+        edit(tmp_path, "complete", tmp_path / "out", *words, num=1, ckpt="labelled")
+        completed = read_scan(tmp_path / "out/scans/dim.bin")
+        assert len(completed) > len(points)
+        assert np.ptp(completed[:, 3]) == 0
+
     @pytest.mark.usefixtures("forked_workers")
     def test_a_folder_is_completed_alike_by_any_number_of_workers(self, files, tmp_path):
         for drive, name in (("x", "a"), ("y", "b"), ("y", "a")):
