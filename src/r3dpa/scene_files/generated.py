@@ -142,10 +142,8 @@ def page_scans(source: Path, columns: Sequence[str] = ()) -> list[Callable[[], v
             raise ScanError(f"{path}: holds {len(clouds)} scans: give the file alone, or remove it")
         (points,) = clouds.values()
         check_metres(path, points)
-        if path.suffix != ".bin":
-            return viz.PageScan(name, points)
-        labels = find_labels(path, len(points))
-        return viz.PageScan(name, points, labels, read_beside(path, "origins"))
+        origins = read_beside(path, "origins") if path.suffix == ".bin" else None
+        return viz.PageScan(name, points, find_labels(path, len(points)), origins)
 
     def member(name: str, points: np.ndarray) -> viz.PageScan:
         check_metres(f"{source}: {name}", points)
