@@ -25,7 +25,7 @@ from r3dpa.flow.sampler import Quality
 from r3dpa.generation import Autoguidance, SamplerConfig, SceneGenerator
 from r3dpa.geometry import BeamProjection, ScanGeometry
 from r3dpa.io import source_commit
-from r3dpa.pretrained import without_features
+from r3dpa.pretrained import weights_file, without_features
 from r3dpa.scene_files.options import SceneOptions
 from r3dpa.stages import BASELINE_STAGES, published_sampler
 
@@ -89,7 +89,7 @@ def autoguidance_of(
     sit, shift = weak.sit.to(device), weak.shift.to(device)
     about = {
         "checkpoint": str(path),
-        "checkpoint_written": written(path),
+        "checkpoint_written": written(weights_file(path)),
         "step": weak.step,
         "scale": scale,
         "interval": list(interval),
