@@ -407,12 +407,27 @@ def test_a_model_without_features_is_refused_before_anything_is_loaded(files, mo
         main([*words.split(), "--ckpt", "None.safetensors"])
 
 
-def test_an_interrupt_ends_in_one_line_and_leaves_nothing(files, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize(
+    ("command", "more", "line"),
+    [
+        ("vary", (), "r3dpa vary: stopped\n"),
+        (
+            "complete",
+            ("--keep_every", 2),
+            "r3dpa complete: stopped; the same command continues\n",
+        ),
+    ],
+)
+def test_an_interrupt_ends_in_one_line_and_leaves_nothing(
+    files, tmp_path, monkeypatch, capsys, command, more, line
+):
+    """Nothing of the first scan; completions go on with the scan after the last finished one."""
+
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(SceneEditor, "vary", interrupted)
+    monkeypatch.setattr(SceneEditor, command, interrupted)
     with pytest.raises(SystemExit, match="130"):
-        edit(files, "vary", tmp_path / "out", "--scan", files / "a.bin")
-    assert capsys.readouterr().err.endswith("r3dpa vary: stopped\n")
+        edit(files, command, tmp_path / "out", "--scan", files / "a.bin", *more)
+    assert capsys.readouterr().err.endswith(line)
     assert not list((tmp_path / "out").rglob("*"))
