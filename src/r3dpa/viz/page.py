@@ -118,7 +118,7 @@ def scan_page(
         )
     shown = [*scans, *others]
     packed = [pack_scan(scan) for scan in shown]
-    labels = [scan.labels & 0xFFFF for scan in shown if scan.labels is not None]
+    labels = [scan.labels.astype(np.int64) & 0xFFFF for scan in shown if scan.labels is not None]
     made_by = [scan.origins for scan in shown if scan.origins is not None]
     heights_m = np.arange(HEIGHT_LIMITS_M[0], HEIGHT_LIMITS_M[1] + 1).tolist()
     brightest = max(header["intensity_max"] for header, _ in packed)
