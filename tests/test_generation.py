@@ -231,7 +231,7 @@ def test_latents_of_float64_are_decoded_and_of_another_shape_refused():
     latents = scenes.noise([0, 1])
     assert scenes.decode(latents.double()).equal(scenes.decode(latents))
     for wrong in (latents[0], torch.zeros(2, 3), latents[:, :3]):
-        with pytest.raises(ValueError, match=r"latents must have shape \(B, \*\(4, 4, 16\)\), got"):
+        with pytest.raises(ValueError, match=r"latents must have shape \(B, 4, 4, 16\), got"):
             scenes.decode(wrong)
     with pytest.raises(ValueError, match="2 scenes need as many indices, got 1"):
         scenes.decode(latents, [0])

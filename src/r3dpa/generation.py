@@ -353,9 +353,8 @@ class SceneGenerator:
                 are not one per scene.
         """
         if latents.ndim != 4 or latents.shape[1:] != self.latent_shape:
-            raise ValueError(
-                f"latents must have shape (B, *{self.latent_shape}), got {tuple(latents.shape)}"
-            )
+            sizes = ", ".join(map(str, self.latent_shape))
+            raise ValueError(f"latents must have shape (B, {sizes}), got {tuple(latents.shape)}")
         if indices is not None and len(indices) != len(latents):
             raise ValueError(f"{len(latents)} scenes need as many indices, got {len(indices)}")
         if not len(latents):

@@ -110,7 +110,8 @@ class SceneVAE:
         weight = next(self.vae.parameters())
         latents = torch.as_tensor(latents, dtype=weight.dtype, device=weight.device)
         if latents.ndim != 4 or latents.shape[1:] != size:
-            raise ValueError(f"latents must have shape (B, *{size}), got {tuple(latents.shape)}")
+            sizes = ", ".join(map(str, size))
+            raise ValueError(f"latents must have shape (B, {sizes}), got {tuple(latents.shape)}")
         image = self.vae.decode(latents).float()
         pixels = self.geometry.codec.pixels_of(image, projection.sensor)
         finite = image.flatten(1).isfinite().all(dim=1)[:, None, None]

@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from tiny_baselines import FIRST_STAGES, SETTINGS, TINY, fit_words
 
 from lidarsim.scan_files import read_scan
@@ -100,10 +101,17 @@ def test_edit_complete(trained, smoke_root, tmp_path):
     scan = next((smoke_root / "data_3d_raw").rglob("*.bin"))
     words = ["--scan", str(scan), "--ckpt", str(path), "--num", "2", "--pictures", "0"]
     words += ["--steps", "4", "--out", str(tmp_path / "out"), "--batch_size", "1"]
-    more = [] if stage == "lidm" else ["--resamplings", "2"]
-    main(["edit", "complete", "--keep_every", "2", *words, *more])
+    more = ["--keep_every", "2", "--resamplings", "2"]
+    if stage == "lidm":
+        with pytest.raises(ValueError, match=r"would read nothing .* blocks of 4 x 8 pixels"):
+            main(["edit", "complete", "--keep_every", "2", *words])
+        assert not (tmp_path / "out").exists()
+        more = ["--sector", "0", "180"]
+    main(["edit", "complete", *words, *more])
     before, made = (np.load(tmp_path / "out" / name) for name in ("before.npy", "range_m.npy"))
-    np.testing.assert_array_equal(made[:, ::2], np.broadcast_to(before[0, ::2], (2, 8, 64)))
+    kept = np.asarray(Image.open(tmp_path / "out/mask.png")) == 0
+    assert kept.sum() == 16 * 64 / 2
+    np.testing.assert_array_equal(made[:, kept], np.broadcast_to(before[0, kept], (2, 512)))
     assert (made[0] != made[1]).any()
     about = json.loads((tmp_path / "out/metadata.json").read_text())
     assert about["nfe"] == (4 if stage == "lidm" else 3 * 2 + 1)
@@ -204,8 +212,10 @@ def test_latents_are_completed(trained):
     none = torch.zeros_like(known)
     free, same = (generator.complete(x, none, seed=1).latents for x in (image, other))
     torch.testing.assert_close(free, same)
-    # A latent is known where all of its pixels are: with a corner of each missing, none is.
+    # A latent is known where all of its pixels are: with a corner missing, it is not.
     corners, (height, width) = torch.ones_like(known), found.latents.shape[-2:]
     corners[:: 16 // height, :: 64 // width] = False
-    partly = generator.complete(image, corners, seed=1).latents
-    torch.testing.assert_close(partly, free)
+    with pytest.raises(ValueError, match="stage lidm would read nothing of the scan"):
+        generator.complete(image, corners, seed=1)
+    corners[0, 0] = True
+    assert generator.known_latents(corners).nonzero().tolist() == [[0, 0, 0, 0]]

@@ -46,6 +46,12 @@ class TestHelp:
         assert stop.value.code == 0
         assert "data features [" in capsys.readouterr().out
 
+    def test_the_help_of_models_shows_how_to_read_a_card(self, capsys):
+        main([])
+        (line,) = (x for x in capsys.readouterr().out.splitlines() if x.startswith("  models"))
+        main(["models", *line.partition("; ")[2].split()[:2]])
+        assert capsys.readouterr().out.startswith("#")
+
     @pytest.mark.parametrize("words", [[], ["-h"], ["edit"], ["edit", "--help"]])
     def test_help_of_no_command_and_of_a_group(self, words, capsys):
         main(words)

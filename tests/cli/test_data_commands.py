@@ -7,17 +7,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from tiny_networks import SIT_ARGS
 
 from lidarsim import Origin, Semantic, load_sensor, simulate
 from lidarsim.scan_files import ScanError, read_scan, write_bin, write_npz, write_ply
+from r3dpa import viz
 from r3dpa.cli import main
 from r3dpa.cli.data import objects, view
 from r3dpa.cli.evaluate import realism
 from r3dpa.editing.objects import ObjectLibrary
 from r3dpa.features import GeometricFeatures
+from r3dpa.geometry import share_outside_view, view_limits_deg
 
+PICTURE = np.zeros((2, 2, 3), np.uint8)
 CALIBRATION = "lasers: [{vert_correction: 0.02}, {vert_correction: -0.1}]"
 
 
@@ -387,6 +391,27 @@ class TestView:
         write_npz(tmp_path / "many.npz", {"a": points(), "b": points()[:, :3]}.items())
         assert self.show(tmp_path / "one.ply", tmp_path / "ply")[2] == [f"{tmp_path.name}/one"]
         assert self.show(tmp_path / "many.npz", tmp_path / "npz")[2] == ["many/a", "many/b"]
+
+    def test_labels_beside_a_scan_of_any_format_are_shown(self, tmp_path):
+        write_ply(tmp_path / "a.ply", points())
+        (tmp_path / "a.label").write_bytes(np.full(200, int(Semantic.CAR), "<u4").tobytes())
+        _, page, _ = self.show(tmp_path / "a.ply", tmp_path / "out")
+        assert [row[1] for row in page["categories"]["semantic"]] == ["car"]
+
+    def test_a_scan_of_another_sensor_fills_its_picture(self, tmp_path, monkeypatch):
+        """A sensor that looks up by 45 degrees, and as far as 100 m."""
+        seen = []
+        monkeypatch.setattr(viz, "range_strips", lambda *given: seen.append(given) or PICTURE)
+        scan = np.random.default_rng(0).uniform(1, 70, (5000, 3))
+        scan[:, 2] = np.hypot(scan[:, 0], scan[:, 1]) * np.linspace(0, 1, 5000)
+        write_ply(tmp_path / "a.ply", scan)
+        _, page, _ = self.show(tmp_path / "a.ply", tmp_path / "out")
+        ((_, projection),) = seen
+        assert share_outside_view(torch.from_numpy(scan), projection) == 0
+        low_deg, high_deg = view_limits_deg(projection)
+        assert -1 < low_deg < high_deg < 46
+        farthest_m = np.linalg.norm(scan, axis=1).max()
+        assert 0.9 * farthest_m < page["scales"]["range"]["high"] < farthest_m + 1
 
     @pytest.mark.parametrize("name", ["a.bin", "a.npz"])
     def test_scans_in_millimetres_are_refused(self, name, tmp_path):

@@ -269,6 +269,18 @@ class TestComplete:
             assert np.array_equal(written[: len(rows)], labels)
             assert not written[len(rows) :].any()
 
+    def test_generated_points_have_intensities_of_the_scan(self, files, tmp_path):
+        """A model knows those of its own sensor; the scan is of one that sees everything dim."""
+        labelled_checkpoint(tmp_path)
+        points = read_scan(files / "a.bin")
+        points[:, 3] = 0.02
+        write_bin(tmp_path / "dim.bin", points)
+        words = ["--scan", tmp_path / "dim.bin", "--sector", -90, 90]
+        edit(tmp_path, "complete", tmp_path / "out", *words, num=1, ckpt="labelled")
+        completed = read_scan(tmp_path / "out/scans/dim.bin")
+        assert len(completed) > len(points)
+        assert np.ptp(completed[:, 3]) == 0
+
     @pytest.mark.usefixtures("forked_workers")
     def test_a_folder_is_completed_alike_by_any_number_of_workers(self, files, tmp_path):
         for drive, name in (("x", "a"), ("y", "b"), ("y", "a")):
@@ -313,6 +325,11 @@ REFUSED = [
     ),
     ("complete", "", "nothing is missing"),
     ("complete", "--keep_every 1", "2 to 8, got 1"),
+    ("complete", "--keep_every 2 --start 3", "start must be a time above 0 .* got 3"),
+    ("inpaint", "--mask m.png --start 0", "start must be a time above 0 .* got 0"),
+    ("inpaint", "--mask m.png --dilation -1", "dilation must be 0 or greater, got -1"),
+    ("inpaint", "--mask m.png --dilation 99", "tokens with any of their .* pixels selected"),
+    ("vary", "--start 2", "start must be a time above 0 .* got 2"),
     ("vary", "--device tpu", "device 'tpu' cannot be used here"),
     ("vary", "--scan tilted.bin", r"tilted.bin: .*outside the field"),
     ("vary", "--scan two.npz", "must hold one scan.*its arrays are x, y"),
@@ -331,6 +348,13 @@ def test_bad_input_is_refused_before_networks_run(
     with pytest.raises(ValueError, match=message):
         edit(files, command, tmp_path / "out", *scan, *more.split())
     assert not (tmp_path / "out").exists()
+    # Nor has --overwrite taken away what an earlier edit wrote.
+    earlier = tmp_path / "earlier"
+    earlier.mkdir()
+    (earlier / "metadata.json").write_text('{"num": 1, "nfe": 1}')
+    with pytest.raises(ValueError, match=message):
+        edit(files, command, earlier, *scan, "--overwrite", *more.split())
+    assert [path.name for path in earlier.iterdir()] == ["metadata.json"]
 
 
 @pytest.mark.usefixtures("no_sheet")
@@ -383,12 +407,27 @@ def test_a_model_without_features_is_refused_before_anything_is_loaded(files, mo
         main([*words.split(), "--ckpt", "None.safetensors"])
 
 
-def test_an_interrupt_ends_in_one_line_and_leaves_nothing(files, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize(
+    ("command", "more", "line"),
+    [
+        ("vary", (), "r3dpa vary: stopped\n"),
+        (
+            "complete",
+            ("--keep_every", 2),
+            "r3dpa complete: stopped; the same command continues\n",
+        ),
+    ],
+)
+def test_an_interrupt_ends_in_one_line_and_leaves_nothing(
+    files, tmp_path, monkeypatch, capsys, command, more, line
+):
+    """Nothing of the first scan; completions go on with the scan after the last finished one."""
+
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(SceneEditor, "vary", interrupted)
+    monkeypatch.setattr(SceneEditor, command, interrupted)
     with pytest.raises(SystemExit, match="130"):
-        edit(files, "vary", tmp_path / "out", "--scan", files / "a.bin")
-    assert capsys.readouterr().err.endswith("r3dpa vary: stopped\n")
+        edit(files, command, tmp_path / "out", "--scan", files / "a.bin", *more)
+    assert capsys.readouterr().err.endswith(line)
     assert not list((tmp_path / "out").rglob("*"))

@@ -64,7 +64,7 @@ def test_data_of_another_sensor_are_refused(tiny_file, tmp_path):
         main(["gallery", "--ckpt", str(tiny_file), "--out", "g.html", "--data", str(data)])
 
 
-def test_classes_and_a_car_where_the_weights_have_them(tmp_path, monkeypatch):
+def test_classes_and_a_car_where_the_weights_have_them(tmp_path, monkeypatch, capsys):
     ordered = []
 
     def recorded(edits, *rest):
@@ -82,6 +82,7 @@ def test_classes_and_a_car_where_the_weights_have_them(tmp_path, monkeypatch):
     car.save(path.with_suffix(".objects"))
     words = ["--ckpt", path, "--num", 1, "--out", tmp_path / "g.html", "--quality", "draft"]
     main(["gallery", *map(str, words), "--device", "cpu"])
+    assert "g.html: 1 scene, " in capsys.readouterr().out  # edits and weather do not count
     made = content(tmp_path / "g.html")
     groups = {group["title"]: group["tiles"] for group in made["film"]["groups"]}
     edits = [made["scans"][tile["scan"]]["name"] for tile in groups["Edits of seed 0"]]

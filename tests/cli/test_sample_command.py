@@ -14,6 +14,7 @@ from tiny_networks import tiny_checkpoint
 
 from lidarsim import Semantic
 from lidarsim.scan_files import read_npz, read_points, read_scan
+from r3dpa import pretrained
 from r3dpa.checkpoints import convert
 from r3dpa.cli import main
 from r3dpa.cli.parser import parse
@@ -27,6 +28,7 @@ from r3dpa.geometry import (
     points_of,
 )
 from r3dpa.io import source_commit
+from r3dpa.pretrained import Weights
 from r3dpa.scene_files.sample import sample as sample_command
 from r3dpa.viz.scenes import COLOURS
 
@@ -216,6 +218,14 @@ class TestSample:
         assert metadata["checkpoint"] == metadata["autoguidance"]["checkpoint"] == tiny_file.name
         for folder in (tiny_file.parent, tmp_path, Path.home()):
             assert str(folder) not in (tmp_path / "metadata.json").read_text()
+
+    def test_the_name_of_weights_can_be_the_guide(self, tiny_file, tmp_path, monkeypatch):
+        known = {"mine": Weights("mine", tiny_file, tiny_file.with_suffix(".md"))}
+        monkeypatch.setattr(pretrained, "shipped", lambda: known)
+        metadata = sample(tiny_file, tmp_path, "--autoguidance", "mine", "--num", 1)
+        assert metadata["autoguidance"]["checkpoint"] == "mine"
+        written = metadata["checkpoint_written"]
+        assert metadata["autoguidance"]["checkpoint_written"] == written
 
     def test_the_guidance_of_the_weights_is_recorded_and_can_be_turned_off(self, tmp_path):
         recorded = {"perturbed_attention": {"block": 1, "scale": 1.5}}

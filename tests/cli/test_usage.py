@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from functools import partial
+from pathlib import Path
 
 import pytest
 import yaml
@@ -17,7 +18,7 @@ from r3dpa.cli import ALIASES, COMMANDS, OWN_PARSER, main
 from r3dpa.cli.class_arguments import class_arguments
 from r3dpa.cli.fit import check_class_arguments
 from r3dpa.cli.messages import argument_names
-from r3dpa.cli.parser import load, make_parser
+from r3dpa.cli.parser import load, make_parser, parse
 from r3dpa.cli.presets import conf_folder, expand_preset, find_configs, stage_files
 
 MISTAKES = {
@@ -338,6 +339,21 @@ def test_completion(typed, completed, completion):
     script = f"{completion}\n{call}"
     done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.split() == completed
+
+
+@pytest.mark.parametrize(
+    ("command", "words", "value"),
+    [
+        ("convert", "--half a b", True),
+        ("convert", "--half No a b", False),
+        ("convert", "a --half=true b --overwrite", True),
+        ("data convert", "--drop_nan a b --columns x y z", True),
+    ],
+)
+def test_a_boolean_option_takes_no_other_word(command, words, value):
+    _, config = parse(load(COMMANDS[command].target), words.split(), command)
+    assert config["drop_nan" if command == "data convert" else "half"] is value
+    assert config["out"] == Path("b")
 
 
 def test_short_names_of_commands_are_unique():

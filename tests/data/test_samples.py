@@ -1,5 +1,6 @@
 import io
 import pickle
+import re
 import shutil
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 import torch
 
 from lidarsim.scan_files import ScanError, write_bin, write_npz, write_ply
-from r3dpa.data.samples import read_samples
+from r3dpa.data.samples import _READERS, READABLE, read_samples
 from r3dpa.data.scans import scan_files
 from r3dpa.geometry import EMPTY_RANGE_M, LidarSensor, SphericalProjection, range_image, unproject
 
@@ -298,6 +299,10 @@ def test_bad_file_is_named_with_what_was_found(tmp_path, kind):
     with pytest.raises(ScanError, match=message) as caught:
         list(read_samples(tmp_path, SENSOR))
     assert str(tmp_path) in str(caught.value)
+
+
+def test_every_suffix_that_can_be_read_is_named():
+    assert {*_READERS, ".pcd.bin"} == set(re.findall(r"\.[a-z.]*[a-z]", READABLE))
 
 
 def test_a_missing_path_is_named(tmp_path):

@@ -266,6 +266,11 @@ def test_find_scans_in_folder_glob_list_and_file(tmp_path, make_scans):
     assert [scan.name for scan in find_scans(tmp_path / "kitti")] == names[:1]
     with pytest.raises(ValueError, match=r"no scan found in .*nowhere"):
         find_scans(str(tmp_path / "nowhere"))
+    (tmp_path / "mixed").mkdir()
+    for name in ("a.ply", "a.pcd"):
+        (tmp_path / "mixed" / name).touch()
+    with pytest.raises(ValueError, match=r"1 \.pcd, 1 \.ply.*: give a folder of one \(in Python"):
+        find_scans(tmp_path / "mixed")
     with pytest.raises(ValueError, match=r"given twice: .*kitti/0000000000\.bin"):
         find_scans([f"{tmp_path}/kitti", f"{tmp_path}/**/*.bin"])
 

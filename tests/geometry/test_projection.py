@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from r3dpa.geometry import (
     EMPTY_RANGE_M,
+    BeamProjection,
     LidarSensor,
     RingProjection,
     SphericalProjection,
@@ -110,6 +111,13 @@ def test_unproject_batches_and_gradients():
     assert torch.equal(points[1, 2], unproject(range_m[1, 2], projection))
     points.square().sum().backward()
     torch.testing.assert_close(range_m.grad, 2 * range_m.detach())
+
+
+@pytest.mark.parametrize("of_pixels", [unproject, points_of])
+@pytest.mark.parametrize("projection", [SphericalProjection(SMALL), BeamProjection.of("vlp16", 16)])
+def test_images_of_another_size_are_refused(of_pixels, projection):
+    with pytest.raises(ValueError, match=r"must be \(\.\.\., \d+, 16\) .* got shape \(1, 16\)"):
+        of_pixels(torch.ones(1, 16), projection)
 
 
 def test_rays_cached_in_inference_mode_take_part_in_a_backward_pass():

@@ -7,12 +7,13 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from lidm_discriminators import LiDARDiscriminator
 from recorded_networks import count, scaled, under, weights_of, with_outputs
 
 from r3dpa.baselines.diffusion_paths import StepPath, inpaint
 from r3dpa.baselines.lidm import LiDM, ReleasedDDIM, released_times
 from r3dpa.baselines.lidm_first_stage import LiDMFirstStage
-from r3dpa.baselines.lidm_networks import LiDARDiscriminator, LiDMUNet, VQAutoencoder
+from r3dpa.baselines.lidm_networks import LiDMUNet, VQAutoencoder
 from r3dpa.baselines.lidm_reader import from_lidm
 from r3dpa.checkpoints import read_checkpoint
 from r3dpa.cli import main

@@ -1,5 +1,7 @@
 """Curves of a run, and accuracy against time: lines, labels and scales are where they belong."""
 
+import os
+
 import numpy as np
 import pytest
 
@@ -34,6 +36,17 @@ def test_files_without_a_training_are_no_curves(tmp_path):
         (tmp_path / f"version_{number}").mkdir()
         (tmp_path / f"version_{number}/metrics.csv").write_text(f"step,{column}\n0,1.0\n")
     assert list(viz.curves.read_curves(tmp_path)) == ["train/flow"]
+
+
+def test_values_of_an_abandoned_start_end_where_the_next_one_begins(tmp_path):
+    """The first start reached step 30, the second went on from a checkpoint of step 10."""
+    starts = ("10,1.0,\n20,9.0,\n25,,8.0\n30,9.0,\n", "15,0.5,\n20,0.25,\n")
+    for number, rows in enumerate(starts):
+        path = tmp_path / f"version_{number}/metrics.csv"
+        path.parent.mkdir()
+        path.write_text(f"step,train/flow,val/error\n{rows}")
+        os.utime(path, (number, number))
+    assert viz.curves.read_curves(tmp_path) == {"train/flow": ([10, 15, 20], [1, 0.5, 0.25])}
 
 
 def test_loss_curves_draws_a_panel_per_quantity_and_logs_where_positive(tmp_path):

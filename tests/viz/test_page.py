@@ -72,6 +72,12 @@ class TestData:
         assert (columns["instance"] == scan.labels >> 16).all()
         assert (columns["origin"] == scan.origins).all()
 
+    def test_labels_may_be_bytes(self):
+        labels = np.array([7, 26, 26], np.uint8)
+        page = scan_page([PageScan("a", np.ones((3, 4)), labels)], "", SEMANTICS, {})
+        assert [row[0] for row in page_data(page)["categories"]["semantic"]] == [7, 26]
+        assert unpacked(page, 0)[1]["semantic"].tolist() == [7, 26, 26]
+
     def test_differences_that_wrap_around_and_a_longer_reach_come_back(self):
         points = np.array([[163, 0, 0, 0], [-163, 0, 0, 0], [163, 1, 2, 9]], np.float32)
         _, columns = unpacked(scan_page([PageScan("a", points)], "", {}, {}), 0)

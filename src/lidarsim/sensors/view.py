@@ -92,6 +92,22 @@ class LidarSensor:
             range_max_m=sensor.max_range_m,
         )
 
+    @classmethod
+    def around(cls, points: NDArray[np.floating]) -> LidarSensor:
+        """Return an image of the default size around points ``(P, 3)`` of any sensor, in metres.
+
+        One point of 1000 may lie beyond each limit. Points at (0, 0, 0) do not count.
+        """
+        points = points[points.any(axis=1)]
+        lowest, highest = np.quantile(np.degrees(angles_of(points)[0]), (0.001, 0.999)).tolist()
+        farthest_m = np.quantile(np.linalg.norm(points, axis=1), 0.999)
+        half_row_deg = max((highest - lowest) / (2 * (cls.beams - 1)), 0.1)
+        return cls(
+            inclination_max_deg=min(highest + half_row_deg, 90.0),
+            inclination_min_deg=max(lowest - half_row_deg, -90.0),
+            range_max_m=max(math.floor(farthest_m) + 1.0, 2 * cls.range_min_m),
+        )
+
     def cell_size(self, grid_size: tuple[int, int]) -> tuple[int, int]:
         """Rows and columns of pixels in one cell of a grid ``(rows, columns)``."""
         rows, columns = grid_size

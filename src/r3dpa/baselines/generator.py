@@ -120,17 +120,33 @@ class BaselineGenerator:
         Pixels that are True in ``known`` ``(H, W)`` are kept. ``resamplings`` goes to
         :func:`~r3dpa.baselines.diffusion_paths.repaint`, with the steps of the sampler. Latents
         are completed without resampling, see :func:`~r3dpa.baselines.diffusion_paths.inpaint`.
+        ``ValueError`` as of :meth:`known_latents`.
         """
         self.calls = 0
-        baseline = self.baseline
+        baseline, mask = self.baseline, self.known_latents(known).to(self.device)
         indices = scene_indices(indices)
         noises = scene_noise(baseline.latent_shape, indices, seed)
         draws = (noise.to(self.device) for noise in noises)
         data = baseline.encode(image.to(self.device)[None]).expand(len(indices), -1, -1, -1)
-        # A latent pixel is known where all of its pixels are.
-        mask = -F.adaptive_max_pool2d(-known[None, None].to(data), data.shape[-2:])
         samples = baseline.complete(self.velocity, data, mask, draws, self.sampler, resamplings)
         return self._scenes(samples)
+
+    def known_latents(self, known: Tensor) -> Tensor:
+        """Mask ``(1, 1, h, w)`` float32, 1 where all pixels of a latent are known ``(H, W)``.
+
+        Raises:
+            ValueError: If pixels are known, but no latent.
+        """
+        size = self.baseline.latent_shape[1:]
+        mask = -F.adaptive_max_pool2d(-known[None, None].float(), size)
+        if known.any() and not mask.any():
+            rows, columns = known.shape[0] // size[0], known.shape[1] // size[1]
+            raise ValueError(
+                f"stage {self.baseline.stage} would read nothing of the scan: it knows blocks of "
+                f"{rows} x {columns} pixels, and in each of them some are missing; leave whole "
+                "blocks, as a sector does, or complete with weights of another stage"
+            )
+        return mask
 
     def noise(self, indices: Sequence[int], seed: int = 0) -> Tensor:
         """First noise ``(B, C, h, w)`` of scenes, on the device of the network."""

@@ -1,4 +1,4 @@
-"""Networks of LiDM: vector-quantised autoencoder, discriminators, U-Net without alignment.
+"""Networks of LiDM: vector-quantised autoencoder, U-Net without alignment.
 
 Encoder, decoder and U-Net are the same as in R3DPA, which took them from LiDM. Letters: B batch,
 C latent channels, H x W image size, h x w latent size.
@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from r3dpa.nn.discriminator import PatchDiscriminator
 from r3dpa.nn.layers import CircularConv2d, Float32CircularConv2d, at_least_float32, no_autocast
 from r3dpa.nn.unet import UNet
 from r3dpa.nn.vae import VAE, Posterior
@@ -125,42 +124,6 @@ class VQAutoencoder(VAE):
     def decode(self, latents: Tensor) -> Tensor:
         """Images ``(B, 1, H, W)`` of latents ``(B, C, h, w)``, which are quantised first."""
         return self.image_of(self.predict(self.quantize(latents).latents))
-
-
-class LiDARDiscriminator(PatchDiscriminator):
-    """Patch discriminators ``v1`` and ``v2`` of LiDM: columns wrap, rows keep their number in v1.
-
-    Args:
-        in_channels: Channels of the image; three with x and y from above.
-        channels: Width of the first layer.
-        num_layers: Strided convolutions after the first ones.
-        wide: Version 2, of a larger receptive field.
-    """
-
-    def __init__(
-        self, in_channels: int = 3, channels: int = 64, num_layers: int = 3, wide: bool = False
-    ) -> None:
-        super().__init__(in_channels, channels, num_layers)
-        layers: list[nn.Module] = []
-        for layer in self.main:
-            if isinstance(layer, nn.Conv2d):
-                first = not layers
-                stride = (1, 2) if first or not wide else (2, 2)
-                stride = stride if layer.stride == (2, 2) else (1, 1)
-                layer = _ring(layer, stride)
-                if first and wide:
-                    layers += [layer, nn.LeakyReLU(0.2)]
-                    layer = _ring(nn.Conv2d(channels, channels, 4), (1, 2))
-            layers.append(layer)
-        self.main = nn.Sequential(*layers)
-
-
-def _ring(layer: nn.Conv2d, stride: tuple[int, int]) -> CircularConv2d:
-    pads = (1, 2, 1, 2)
-    ring = CircularConv2d(layer.in_channels, layer.out_channels, (4, 4), stride, pads)
-    nn.init.normal_(ring.weight, 0.0, 0.02)
-    ring.bias = None if layer.bias is None else nn.Parameter(torch.zeros(layer.out_channels))
-    return ring
 
 
 class LiDMUNet(UNet):

@@ -47,11 +47,13 @@ COMMANDS = {
     "gallery": Command("gallery:gallery", "write a page of scenes, nearest scans and edits"),
     "edit inpaint": Command("edit:inpaint", "generate a part of a scan anew"),
     "edit mix": Command("edit:mix", "generate scenes that follow one scan on each side"),
-    "edit complete": Command("edit:complete", "fill a missing sector or dropped beams"),
+    "edit complete": Command("edit:complete", "fill a missing sector or dropped beams", True),
     "edit vary": Command("edit:vary", "generate scenes similar to a scan"),
     "edit interpolate": Command("edit:interpolate", "generate the scenes between two scans"),
     "evaluate": Command("evaluate:evaluate", "compare samples of any generator with real scans"),
-    "models": Command("r3dpa.pretrained:models", "list trained weights, or show their card"),
+    "models": Command(
+        "r3dpa.pretrained:models", "list trained weights; --name r3dpa-s shows a card"
+    ),
     "cite": Command("r3dpa.citations:cite", "print BibTeX of what a checkpoint used"),
     "convert": Command("runs:convert", "convert checkpoints from and to the official layout"),
     "report": Command("runs:report", "draw the loss curves of a run and list the losses"),

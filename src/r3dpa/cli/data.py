@@ -82,6 +82,8 @@ def view(
 ) -> str:
     """Draw scans as range images, from above, and as a page with point clouds to turn.
 
+    Range images reach as far up, down and away as the points of the scans.
+
     Args:
         source: A scan of any format that can be read, a folder of scans, or a ``.npz`` of scans.
         out: Folder for the pictures and the page; default: ``view/<name of the source>``.
@@ -89,6 +91,8 @@ def view(
         columns: Columns of files without names, such as ``x,y,z,intensity,ring``; default:
             inferred from the values.
     """
+    import numpy as np
+
     from r3dpa import viz
     from r3dpa.data.scans import evenly
     from r3dpa.geometry import LidarSensor, SphericalProjection
@@ -101,11 +105,14 @@ def view(
     drawn = {scan.name: scan.points for scan in scans}
     resolved = source.resolve()
     out = out or Path("view") / (resolved.name if resolved.is_dir() else resolved.stem)
-    strips = viz.range_strips(drawn, SphericalProjection(LidarSensor()))
+    points = np.concatenate([scan.points[:, :3] for scan in scans])
+    sensor = LidarSensor.around(points)
+    strips = viz.range_strips(drawn, SphericalProjection(sensor))
+    title = f"{resolved.name} - r3dpa data view"
     paths = [
         viz.save(strips, out / "range_images.png"),
         viz.save(viz.birds_eye_sheet(drawn), out / "birds_eye.png"),
-        write_page(out / "view.html", scans, f"{resolved.name} - r3dpa data view"),
+        write_page(out / "view.html", scans, title, sensor=sensor),
     ]
     line = f"{len(scans)} of {len(readers)} scans in {source}"
     return "\n".join([line, *map(str, paths), "open the .html file in a browser"])

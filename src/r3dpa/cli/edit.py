@@ -84,9 +84,11 @@ def inpaint(
         arguments["sorted_of"] = num  # another number of draws is sorted anew
     from r3dpa.editing import EditResult, most_like_first, regions
     from r3dpa.editing.objects import ObjectLibrary
+    from r3dpa.editing.settings import check_start
     from r3dpa.scene_files.edits import EditSession
     from r3dpa.scene_files.generated import feature_source_of
 
+    check_start(start)
     feature = semantic_class = extractor = inside = front_m = None
     if object is not None and objects is not None:
         library = ObjectLibrary.load(objects)
@@ -108,6 +110,8 @@ def inpaint(
         inside = partial(regions.in_box3d, **place)
         if feature is not None:
             front_m = regions.box3d_front_m(session.projection, **place)
+    # The editor refuses such a part too, but --overwrite has emptied the folder by then.
+    regions.token_mask(region, session.sit.grid_size, dilation)
     if feature is not None:
         library.check_source(feature_source_of(session.checkpoint), session.sit.feature_dim)
         if features_ckpt is not None or library.source in OWN_WEIGHTS:
@@ -261,8 +265,10 @@ def vary(*, scan: Path, start: float = 0.5, num: PositiveInt = 8, **options: Any
         **options: See :class:`EditOptions`.
     """
     arguments = {"scan": scan, "start": start}
+    from r3dpa.editing.settings import check_start
     from r3dpa.scene_files.edits import EditSession
 
+    check_start(start)
     session = EditSession(EditOptions(**options), num)
     source = session.read(scan)
     run = partial(session.editor.vary, source.pixels, num, session.options.seed, start=start)

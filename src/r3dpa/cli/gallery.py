@@ -58,4 +58,4 @@ def gallery(
     page = gallery_page(generator, str(ckpt), num, edit, module, seed, batch_size)
     html = page.html("r3dpa gallery")
     write_text(out, html)
-    return f"open {out}: {number_of(len(page.scans), 'scene')}, {len(html) / 1e6:.0f} MB"
+    return f"open {out}: {number_of(num, 'scene')}, {len(html) / 1e6:.0f} MB"

@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import is_dataclass
 from importlib import import_module
 from inspect import cleandoc
+from itertools import zip_longest
 from pathlib import Path
 from types import UnionType
 from typing import Any, NoReturn, Union, cast, get_args, get_origin
@@ -45,6 +46,7 @@ def _load_yaml_of_any_version(text: str) -> Any:
 set_loader("yaml", _load_yaml_of_any_version, (yaml.YAMLError,))
 # One word for one thing in all commands; the function's own name is an option as well.
 _COMMON_NAMES = {"limit": "--num", "frames": "--num", "scenes": "--num", "jobs": "--workers"}
+_BOOLEANS = ("true", "false", "yes", "no", "on", "off")  # of YAML
 # Arguments whose files and folders must exist.
 _INPUTS = (
     "source",
@@ -142,6 +144,25 @@ class Parser(ArgumentParser):
         text = describe_error(message, ex, parser, self.words)
         sys.stderr.write(f"{prog}: {text}; see {prog} --help\n")
         sys.exit(2)
+
+
+def add_flag_values(parser: Parser, words: Sequence[str]) -> list[str]:
+    """Write ``true`` after each boolean option without a value.
+
+    argparse would take the next word for it, such as the input of a command.
+    """
+    flags = {
+        name
+        for action in parser._actions
+        if getattr(action, "_typehint", None) is bool
+        for name in action.option_strings
+    }
+    completed: list[str] = []
+    for word, following in zip_longest(words, words[1:], fillvalue=""):
+        completed.append(word)
+        if word in flags and following.lower() not in _BOOLEANS:
+            completed.append("true")
+    return completed
 
 
 def join_list_words(parser: Parser, words: Sequence[str]) -> list[str]:
@@ -243,7 +264,8 @@ def parse(
     """Make the parser of a function, and parse a command line with it."""
     parser = make_parser(function, prog)
     parser.words = words
-    return parser, parser.parse_args(join_list_words(parser, words))
+    words = join_list_words(parser, add_flag_values(parser, words))
+    return parser, parser.parse_args(words)
 
 
 def run_function(function: Callable[..., Any], words: Sequence[str], prog: str) -> Any:

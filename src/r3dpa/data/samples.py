@@ -43,7 +43,10 @@ from r3dpa.geometry import EMPTY_RANGE_M, LidarSensor, SphericalProjection, in_r
 from r3dpa.io import UNPICKLING_ERRORS, first_line
 
 Arrays = Iterator[tuple[str, np.ndarray]]  # name within the file and cloud (P, ...) or (C, H, W)
-READABLE = "clouds as .bin, .ply, .pcd, .las, .txt, .npz; range images as .npz, .npy, .pth"
+READABLE = (
+    "clouds as .bin, .pcd.bin, .ply, .pcd, .las, .laz, .txt, .npz, .npy; range images as .npz, "
+    ".npy, .pth, .pt"
+)
 # Of the range: more than bfloat16 rounds off, far less than channels in another order differ.
 _LENGTH_TOLERANCE = 0.02
 

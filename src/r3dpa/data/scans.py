@@ -198,7 +198,7 @@ def _of_one_format(source: Path, files: Iterable[Path]) -> list[Path]:
         formats = ", ".join(f"{len(files)} {suffix}" for suffix, files in sorted(scans.items()))
         raise ValueError(
             f"{source}: holds several formats ({formats}), perhaps each scan more than once: give "
-            "a glob of one, such as '**/*.pcd'"
+            "a folder of one (in Python and in YAML files also a glob such as '**/*.pcd')"
         )
     return scans.get(".bin") or [file for paths in scans.values() for file in paths]
 

@@ -29,7 +29,7 @@ from r3dpa.editing.latents import Trajectory, invert, noise_inside_mask, restore
 from r3dpa.editing.pixel_batches import batch_of, concatenate, interpolated, paste
 from r3dpa.editing.placement import correct_data, is_corrected, move_behind
 from r3dpa.editing.regions import check_mask, mask_of_tokens, token_mask
-from r3dpa.editing.settings import EditSettings
+from r3dpa.editing.settings import EditSettings, check_start
 from r3dpa.flow.guidance import FeatureGuidance, FeatureTarget
 from r3dpa.flow.noise import scene_noise
 from r3dpa.flow.solvers import AfterStep, Velocity, evaluations, ode_solver, unchanged
@@ -285,8 +285,7 @@ class SceneEditor:
             start: Time of the noise, in (0, 1]; larger values rely less on the interpolation.
         """
         missing = self._checked_mask(missing, "mask of what is missing")
-        if not 0 < start <= 1:
-            raise ValueError(f"start must be a time above 0 (scan) up to 1 (noise), got {start:g}")
+        check_start(start)
         pixels = self.pixels(scan)
         latents = self._encode(batch_of(interpolated(pixels, missing)))
         path, shape = self.generator.interpolant, self.generator.latent_shape

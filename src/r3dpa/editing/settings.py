@@ -10,6 +10,12 @@ from r3dpa.flow.solvers import ODE_SOLVERS
 from r3dpa.flow.times import check_interval, ode_times
 
 
+def check_start(start: float) -> None:
+    """Refuse a start of the way back that is no time in (0, 1]."""
+    if not 0 < start <= 1:
+        raise ValueError(f"start must be a time above 0 (scan) up to 1 (noise), got {start:g}")
+
+
 @dataclass(frozen=True)
 class EditSettings:
     """Settings of the inversion of latents to noise and back.
@@ -44,6 +50,5 @@ class EditSettings:
 
     def times(self, start: float) -> Tensor:
         """Times from ``start`` in (0, 1] to the data."""
-        if not 0 < start <= 1:
-            raise ValueError(f"start must be a time above 0 (scan) up to 1 (noise), got {start:g}")
+        check_start(start)
         return ode_times(self.steps, start, shift=self.shift)

@@ -214,7 +214,16 @@ def unproject(range_m: Tensor, projection: Projection, corner: bool = False) -> 
     Returns:
         ``(..., H, W, 3)`` metres, in the dtype of ``range_m``; the origin where ``range_m`` is
         not positive, that is without a return. :func:`in_range` is False there.
+
+    Raises:
+        ValueError: If the image is of another size than the projection.
     """
+    size = projection.sensor.beams, projection.sensor.columns
+    if range_m.shape[-2:] != size:
+        raise ValueError(
+            f"range_m must be (..., {size[0]}, {size[1]}) for this projection, got shape "
+            f"{tuple(range_m.shape)}"
+        )
     directions = ray_directions(projection, corner, range_m.dtype, range_m.device)
     if isinstance(projection, BeamProjection):
         return _from_centres(range_m, directions, projection.origins(corner).to(range_m))

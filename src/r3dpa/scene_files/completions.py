@@ -24,6 +24,7 @@ from r3dpa.editing import EditResult
 from r3dpa.editing.editor import COMPLETION_START
 from r3dpa.editing.gaps import interpolate_gaps, range_error_m, unseen_pixels
 from r3dpa.editing.regions import check_mask, dropped_beams, sector, sensor_pair
+from r3dpa.editing.settings import check_start
 from r3dpa.geometry import (
     Pixels,
     Projection,
@@ -86,7 +87,6 @@ class Completion(NamedTuple):
     """Result of a worker: NumPy arrays travel between processes as they are."""
 
     range_m: np.ndarray
-    intensity: np.ndarray | None
     nfe: int
 
 
@@ -118,6 +118,8 @@ class CompletionJob:
         view = session.view(path, cloud)
         missing = self.missing.find(view.pixels.range_m, session)
         session.check(view, missing)
+        if session.baseline is not None:
+            session.baseline.known_latents(~missing)  # refuses what it could read nothing of
         return cloud, view, missing
 
     def __call__(self, path: Path) -> Completion:
@@ -137,8 +139,7 @@ class CompletionJob:
             completed = _completed_cloud(cloud, result, index, missing)
             folder = self.options.out / _SCANS
             write_below(completed, self.root, folder / str(index) if self.num > 1 else folder)
-        intensity = None if result.intensity is None else result.intensity.numpy()
-        return Completion(result.range_m.numpy(), intensity, result.nfe)
+        return Completion(result.range_m.numpy(), result.nfe)
 
 
 @lru_cache(maxsize=1)
@@ -156,8 +157,10 @@ def complete_files(
     refuse_folder_of_scans(options.out, root, len(paths))
     session = _session(options, num)
     stage = session.checkpoint.stage
-    if job.start is not None and session.baseline is not None:
-        raise ValueError(f"--start is for R3DPA: stage {stage} starts from noise")
+    if job.start is not None:
+        check_start(job.start)
+        if session.baseline is not None:
+            raise ValueError(f"--start is for R3DPA: stage {stage} starts from noise")
     if job.resamplings is not None and stage not in ("r2dm", "r2flow"):
         raise ValueError(f"--resamplings is for R2DM and R2Flow, not for stage {stage}")
     threads = None if workers == 1 else max(1, (os.cpu_count() or 1) // workers)
@@ -173,12 +176,7 @@ def complete_files(
         results = in_processes(job, paths[done:], workers)
         bar = tqdm(results, total=len(paths), initial=done, unit="scan", disable=None)
         for completion in bar:
-            intensity = completion.intensity
-            writer.put(
-                torch.from_numpy(completion.range_m),
-                completion.nfe,
-                None if intensity is None else torch.from_numpy(intensity),
-            )
+            writer.put(torch.from_numpy(completion.range_m), completion.nfe)
         writer.close()
         images = np.load(writer.range_path, mmap_mode="r")
         images = images.reshape(len(paths), num, *images.shape[1:])
@@ -203,24 +201,16 @@ def _completed_cloud(
 ) -> PointCloud:
     """Scan with all its points, and generated ones where it has no point.
 
-    Generated points take intensity and further columns from the nearest point of the scan, if the
-    model has no intensity; labels come from the model, else they are 0.
+    Generated points take intensity and further columns from the nearest point of the scan: a model
+    knows the intensities of the sensor that it was trained on. Labels come from the model, else
+    they are 0.
     """
     points, projection = cloud.points.astype(np.float32), result.projection
     empty = missing & ~_occupied(torch.from_numpy(points), projection)
     range_m = torch.where(empty, result.range_m[index], -1.0)
     added = points_of(range_m, projection).numpy()
     nearest = cKDTree(points).query(added)[1].astype(np.int64)
-    intensity, labels = cloud.intensity, cloud.labels
-    if intensity is not None:
-        added_intensity = intensity[nearest]
-        if result.intensity is not None:
-            shares = values_at_returns(result.intensity[index], range_m, projection).numpy()
-            added_intensity = cloud.full_intensity * shares
-            if intensity.dtype.kind in "iu":
-                added_intensity = np.rint(added_intensity)
-            added_intensity = added_intensity.astype(intensity.dtype)
-        intensity = np.concatenate([intensity, added_intensity])
+    labels = cloud.labels
     if labels is not None:
         added_labels = np.zeros(len(added), labels.dtype)
         if result.labels is not None:
@@ -228,7 +218,7 @@ def _completed_cloud(
             added_labels = classes_as_of_cloud(classes, cloud).astype(labels.dtype)
         labels = np.concatenate([labels, added_labels])
     rows = np.concatenate([np.arange(len(cloud)), nearest])
-    return cloud.changed(rows, np.concatenate([points, added]), intensity, labels)
+    return cloud.changed(rows, np.concatenate([points, added]), labels=labels)
 
 
 def _occupied(points: Tensor, projection: Projection) -> Tensor:

@@ -168,11 +168,8 @@ class EditSession:
         def joined(name: str) -> Tensor:
             return torch.cat([getattr(batch, name) for batch in batches]).cpu()
 
-        intensity = None
-        if self.geometry.codec.reflectance:
-            intensity = torch.where(missing, joined("intensity"), scan_intensity)
         ranges = torch.where(missing, joined("range_m"), range_m)
-        return EditResult(ranges, joined("latents"), batches[0].nfe, self.projection, intensity)
+        return EditResult(ranges, joined("latents"), batches[0].nfe, self.projection)
 
     def read_mask(self, path: Path) -> Tensor:
         """Mask ``(H, W)`` of a picture; refused if it selects nothing or all."""

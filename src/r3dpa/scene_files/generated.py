@@ -25,7 +25,7 @@ from r3dpa.flow.sampler import Quality
 from r3dpa.generation import Autoguidance, SamplerConfig, SceneGenerator
 from r3dpa.geometry import BeamProjection, ScanGeometry
 from r3dpa.io import source_commit
-from r3dpa.pretrained import without_features
+from r3dpa.pretrained import weights_file, without_features
 from r3dpa.scene_files.options import SceneOptions
 from r3dpa.stages import BASELINE_STAGES, published_sampler
 
@@ -89,7 +89,7 @@ def autoguidance_of(
     sit, shift = weak.sit.to(device), weak.shift.to(device)
     about = {
         "checkpoint": str(path),
-        "checkpoint_written": written(path),
+        "checkpoint_written": written(weights_file(path)),
         "step": weak.step,
         "scale": scale,
         "interval": list(interval),
@@ -142,10 +142,8 @@ def page_scans(source: Path, columns: Sequence[str] = ()) -> list[Callable[[], v
             raise ScanError(f"{path}: holds {len(clouds)} scans: give the file alone, or remove it")
         (points,) = clouds.values()
         check_metres(path, points)
-        if path.suffix != ".bin":
-            return viz.PageScan(name, points)
-        labels = find_labels(path, len(points))
-        return viz.PageScan(name, points, labels, read_beside(path, "origins"))
+        origins = read_beside(path, "origins") if path.suffix == ".bin" else None
+        return viz.PageScan(name, points, find_labels(path, len(points)), origins)
 
     def member(name: str, points: np.ndarray) -> viz.PageScan:
         check_metres(f"{source}: {name}", points)

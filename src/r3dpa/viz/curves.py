@@ -87,8 +87,8 @@ def read_metrics(path: str | Path) -> dict[str, Series]:
 def read_curves(run: Path) -> dict[str, Series]:
     """Quantities of a training by step, from the ``version_*/metrics.csv`` of each start.
 
-    Where a start repeats steps of an earlier one, its values replace the earlier ones. Files of
-    ``r3dpa validate`` and ``test``, which have no training losses, are left out.
+    The values of earlier starts end where a later one begins, which did not go on from them. Files
+    of ``r3dpa validate`` and ``test``, which have no training losses, are left out.
     """
     curves: dict[str, dict[float, float]] = {}
     paths = run.glob("version_*/metrics.csv")
@@ -96,9 +96,12 @@ def read_curves(run: Path) -> dict[str, Series]:
         series = read_metrics(path)
         if series and all(name.startswith(("val/", "test/")) for name in series):
             continue
+        first = min((min(steps) for steps, _ in series.values()), default=math.inf)
+        for name, curve in curves.items():
+            curves[name] = {step: value for step, value in curve.items() if step < first}
         for name, (steps, values) in series.items():
             curves.setdefault(name, {}).update(zip(steps, values, strict=True))
-    ordered = {name: sorted(curve.items()) for name, curve in curves.items()}
+    ordered = {name: sorted(curve.items()) for name, curve in curves.items() if curve}
     return {name: ([s for s, _ in c], [v for _, v in c]) for name, c in ordered.items()}
 
 

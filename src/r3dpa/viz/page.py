@@ -23,7 +23,7 @@ import torch
 from matplotlib.colors import Colormap
 from numpy.typing import NDArray
 
-from r3dpa.geometry import LidarSensor, Projection, points_of
+from r3dpa.geometry import LidarSensor, Projection, points_of, values_at_returns
 from r3dpa.viz.figures import part_colours
 from r3dpa.viz.pictures import (
     BACKGROUND,
@@ -118,7 +118,7 @@ def scan_page(
         )
     shown = [*scans, *others]
     packed = [pack_scan(scan) for scan in shown]
-    labels = [scan.labels & 0xFFFF for scan in shown if scan.labels is not None]
+    labels = [scan.labels.astype(np.int64) & 0xFFFF for scan in shown if scan.labels is not None]
     made_by = [scan.origins for scan in shown if scan.origins is not None]
     heights_m = np.arange(HEIGHT_LIMITS_M[0], HEIGHT_LIMITS_M[1] + 1).tolist()
     brightest = max(header["intensity_max"] for header, _ in packed)
@@ -181,13 +181,13 @@ def edit_page(
     Raises:
         ValueError: If no image has a return.
     """
-    order = projection.column_order()
     shown = []
     for name, range_m in {**after, **before}.items():
-        image = torch.as_tensor(range_m)
-        filled = (image[:, order] > 0).numpy()
-        labels = None if parts is None else parts[:, order.numpy()][filled].astype(np.uint32)
-        if filled.any():
+        image, labels = torch.as_tensor(range_m), None
+        if parts is not None:
+            numbers = torch.from_numpy(parts.astype(np.int64))
+            labels = values_at_returns(numbers, image, projection).numpy()
+        if (image > 0).any():
             shown.append(PageScan(name, points_of(image, projection), labels))
     named = zip(part_names, part_colours(part_names), strict=True)
     categories = {number: Category(*part) for number, part in enumerate(named)}
