@@ -33,7 +33,7 @@ def test_a_table_says_that_the_interval_of_a_mean_is_over_its_trainings():
     seeds[0].about["extra"]["verdict"] = "of the scenes of this seed"
     mean = mean_of_seeds("row", seeds)
     table = str(EvaluationTable([mean]))
-    assert "- row: mean of 2 trainings, whose interval is over these" in table
+    assert "of a mean over trainings, over these" in table
     assert "verdict" not in mean.about["extra"]
 
 

@@ -240,8 +240,8 @@ def test_a_table_as_text(table):
         "",
         "- **best**, _second_, = tie: no further apart than the floor or the intervals",
         "- [low, high]: 95 % interval (measured to hold in 90 to 99 %) over draws of as many "
-        "generated scenes against the same real scans (MMD: real scans drawn, generated scenes "
-        "fixed)",
+        "generated scenes against the same real scans; of a mean over trainings, over these (MMD: "
+        "real scans drawn, generated scenes fixed)",
         "- published: against KITTI-360 val, 1000 scans, not ranked",
         "- c, FLD: no net",
     ]

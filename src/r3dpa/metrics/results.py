@@ -36,7 +36,7 @@ _SHOWN_BAD = 20  # samples left out that are printed
 # Measured in notebooks/results/interval_coverage.json.
 _INTERVAL = (
     "95 % interval (measured to hold in 90 to 99 %) over draws of as many generated scenes "
-    "against the same real scans"
+    "against the same real scans; of a mean over trainings, over these"
 )
 _FLOOR = "real vs. real (floor)"
 #: Of references that were computed before they named their data set.
@@ -292,12 +292,7 @@ class EvaluationTable:
         table = text_table(self._lines(cell), ["", *heads], "l" + "r" * len(heads), "pipe")
         marks = "**best**, _second_, = tie: no further apart than the floor or the intervals"
         interval = f"[low, high]: {_INTERVAL} (MMD: real scans drawn, generated scenes fixed)"
-        seeds = [
-            f"{e.name}: mean of {e.about['extra']['seeds']} trainings, whose interval is over these"
-            for e in self.evaluations
-            if "seeds" in e.about["extra"]
-        ]
-        below = [f"- {text}" for text in (marks, interval, *seeds, *self.notes)]
+        below = [f"- {text}" for text in (marks, interval, *self.notes)]
         return "\n".join([table, "", *below]) + "\n"
 
     def latex(self) -> str:
