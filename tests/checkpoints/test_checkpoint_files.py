@@ -233,7 +233,7 @@ def test_guidance_among_the_arguments_of_a_sit_is_read_as_a_sampling_setting(tmp
     plain = current_network(about["networks"]["ema"])
     assert plain == {"class_path": "r3dpa.nn.sit.SiT", "init_args": SIT_ARGS}
     shipped = read_checkpoint("r3dpa-s")
-    assert shipped.sampling == {"perturbed_attention": {"block": 6, "scale": 1.5}}
+    assert shipped.sampling == {"perturbed_attention": {"block": 6, "scale": 1.2}}
 
 
 @pytest.mark.parametrize("given", [{"encoding": "linear"}, {"sit_args": {"depth": 2}}])
