@@ -168,3 +168,9 @@ def test_far_latents_decode_to_finite_images(how, vae):
     error = (decoded - expected).norm() / expected.norm()
     assert error < (1e-6 if how == "float32" else 0.05)
     assert (~broken.isfinite()).float().mean() > 0.5
+
+
+def test_images_without_the_channels_that_an_encoder_sees_are_refused():
+    vae = VAE(in_channels=2, channels=32, channel_multipliers=(1,), strides=(), intensity=True)
+    with pytest.raises(ValueError, match="needs images of 3 channels, got 2"):
+        vae.encode(torch.zeros(1, 2, 8, 16))

@@ -58,6 +58,7 @@ class Encoder(nn.Module):
         self.mid = _Middle(last)
         self.norm_out = GroupNorm(last)
         self.conv_out = CircularConv2d(last, out_channels, (3, 3))
+        self.image_channels = in_channels + intensity + (num_classes > 0)
         self.further_in: nn.Module | None = None
         if further := intensity + num_classes:
             self.further_in = zeroed(CircularConv2d(further * math.prod(stem), first, (1, 1)))
@@ -77,6 +78,12 @@ class Encoder(nn.Module):
 
     def _further(self, image: Tensor) -> Tensor:
         """Intensity where images have it, and a channel for each class: 1 where it is, else 0."""
+        if image.shape[1] != self.image_channels:
+            raise ValueError(
+                f"this encoder sees intensity or class: it needs images of {self.image_channels} "
+                f"channels, got {image.shape[1]}; the codec of the checkpoint makes them, with an "
+                "intensity of 0 and no class where these are unknown"
+            )
         further = image[:, self.in_channels :]
         if not self.num_classes:
             return further
