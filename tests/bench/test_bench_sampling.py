@@ -196,6 +196,20 @@ class TestInterruptedRun:
         assert rounds[0][0] == first[0]
 
 
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"reference_steps": 1}, "reference_steps must be at least 2, got 1"),
+        ({"evaluations": (1,)}, "midpoint cannot make a step with 1 network evaluation"),
+    ],
+)
+def test_refused_numbers_leave_no_unfinished_work(given, message, ckpt, tmp_path):
+    """It would block the corrected command."""
+    with pytest.raises(ValueError, match=message):
+        sampling(tmp_path, ckpt, quick=True, effort=EFFORT | given)
+    assert not (tmp_path / "work").exists()
+
+
 def test_options_of_a_model_are_refused_without_one(tmp_path):
     """Without it they would be ignored: the mixture has its own numbers."""
     words = ["bench", "sampling", "--out", str(tmp_path / "out"), "--scenes", "4", "--nfe", "[4]"]

@@ -56,3 +56,16 @@ def test_r3dpa_passes_the_classes_on():
     assert r3dpa.Simulator is Simulator
     assert r3dpa.Weather is Weather
     assert r3dpa.RecordedScan is RecordedScan
+
+
+def test_an_image_around_points_holds_nearly_all_of_them():
+    """Points at the origin and with NaN have no say."""
+    angles = np.radians(np.linspace(-12.0, 20.0, 400))
+    points = 30.0 * np.stack([np.cos(angles), np.zeros(400), np.sin(angles)], axis=1)
+    points = np.concatenate([points, np.zeros((50, 3)), np.full((50, 3), np.nan)])
+    sensor = LidarSensor.around(points)
+    assert sensor.inclination_min_deg == pytest.approx(-12, abs=0.5)
+    assert sensor.inclination_max_deg == pytest.approx(20, abs=0.5)
+    assert sensor.range_max_m == pytest.approx(30.5, abs=0.6)
+    with pytest.raises(ValueError, match="nothing to draw"):
+        LidarSensor.around(points[400:])

@@ -96,9 +96,14 @@ class LidarSensor:
     def around(cls, points: NDArray[np.floating]) -> LidarSensor:
         """Return an image of the default size around points ``(P, 3)`` of any sensor, in metres.
 
-        One point of 1000 may lie beyond each limit. Points at (0, 0, 0) do not count.
+        One point of 1000 may lie beyond each limit. Points at (0, 0, 0) or with NaN do not count.
+
+        Raises:
+            ValueError: If no point counts.
         """
-        points = points[points.any(axis=1)]
+        points = points[np.isfinite(points).all(axis=1) & points.any(axis=1)]
+        if not len(points):
+            raise ValueError("no point with a range and a direction: there is nothing to draw")
         lowest, highest = np.quantile(np.degrees(angles_of(points)[0]), (0.001, 0.999)).tolist()
         farthest_m = np.quantile(np.linalg.norm(points, axis=1), 0.999)
         half_row_deg = max((highest - lowest) / (2 * (cls.beams - 1)), 0.1)
